@@ -24,7 +24,7 @@ def folder(whole_decoder: Path, tmp_path: Path) -> Path:
     return shutil.copytree(whole_decoder, tmp_path / "copy")
 
 
-def truncated(path: Path) -> None:
+def truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
 
@@ -41,7 +41,7 @@ def test_decoder_survives_save_and_load_bit_exactly(whole_decoder: Path, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("damage", "found"), [(Path.unlink, "No such file"), (truncated, "not a complete safetensors file")]
+    ("damage", "found"), [(Path.unlink, "No such file"), (truncate, "not a complete safetensors file")]
 )
 def test_damaged_weights_raise_with_their_name(folder: Path, damage: Callable[[Path], None], found: str) -> None:
     damage(folder / WEIGHTS)
@@ -115,22 +115,22 @@ def test_decoder_of_other_data_warns_with_both_data_sets(
 SIZES = ["linear", "tiny"]
 
 
-def decoder_of(size: str, seed: int = 0) -> Decoder:
+def make_decoder_of_size(size: str, seed: int = 0) -> Decoder:
     decoder = Decoder(DecoderShape(size, dim=24, grid=3, patch_size=8))  # type: ignore[arg-type]
     decoder.initialise(torch.Generator().manual_seed(seed))
     return decoder.eval()
 
 
-def latents_of(*batch: int, seed: int = 1) -> torch.Tensor:
+def random_latents(*batch: int, seed: int = 1) -> torch.Tensor:
     return torch.randn(*batch, 9, 24, generator=torch.Generator().manual_seed(seed))
 
 
 @pytest.mark.parametrize("size", SIZES)
 def test_decoded_image_depends_on_its_own_frame_only(size: str) -> None:
-    decoder, latents = decoder_of(size), latents_of(4)
+    decoder, latents = make_decoder_of_size(size), random_latents(4)
     images = decoder.decode(latents)
     other = latents.clone()
-    other[2] = latents_of(1, seed=2)[0]
+    other[2] = random_latents(1, seed=2)[0]
     changed = decoder.decode(other)
     same = [torch.equal(one, two) for one, two in zip(images, changed, strict=True)]
     assert same == [True, True, False, True]
@@ -138,7 +138,7 @@ def test_decoded_image_depends_on_its_own_frame_only(size: str) -> None:
 
 @pytest.mark.parametrize("size", SIZES)
 def test_decoded_images_are_independent_of_the_chunk_size(size: str) -> None:
-    decoder, latents = decoder_of(size), latents_of(2, 5)
+    decoder, latents = make_decoder_of_size(size), random_latents(2, 5)
     whole = decoder.decode(latents)
     assert whole.shape == (2, 5, 3, 24, 24)
     for chunk in (1, 3, 4):
@@ -147,7 +147,7 @@ def test_decoded_images_are_independent_of_the_chunk_size(size: str) -> None:
 
 
 def test_decoder_starts_equal_to_the_linear_decoder() -> None:
-    linear, decoder, latents = decoder_of("linear", seed=3), decoder_of("tiny"), latents_of(3)
+    linear, decoder, latents = make_decoder_of_size("linear", seed=3), make_decoder_of_size("tiny"), random_latents(3)
     assert not torch.equal(decoder(latents), linear(latents))
     decoder.copy_linear(linear)
     assert torch.equal(decoder(latents), linear(latents))
@@ -158,11 +158,11 @@ def test_decoder_starts_equal_to_the_linear_decoder() -> None:
 
 
 def test_patch_depends_on_one_token_in_the_linear_decoder_and_on_all_in_others() -> None:
-    latents = latents_of(1)
+    latents = random_latents(1)
     other = latents.clone()
     other[0, 5] += 1.0  # second row, third column
     for size in SIZES:
-        decoder = decoder_of(size)
+        decoder = make_decoder_of_size(size)
         moved = (decoder(latents) != decoder(other))[0].any(dim=0)
         inside = torch.zeros_like(moved)
         inside[8:16, 16:24] = True

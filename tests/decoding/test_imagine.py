@@ -19,7 +19,7 @@ STEPS, TOKENS, DIM = 4, 4, 12
 STATE = np.array([0.4, 0.1, 0.3, 3.1, 0.0, -3.1, 0.9])
 
 
-class Remembering:
+class RecordingModel:
     """A model that answers with the first frame, and remembers what it was given."""
 
     def rollout(self, context: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
@@ -31,13 +31,13 @@ def truth() -> Tensor:
     return torch.randn(STEPS + 1, TOKENS, DIM, generator=torch.Generator().manual_seed(0))
 
 
-def start_of(latents: Tensor, **more: Tensor) -> Start:
+def make_start(latents: Tensor, **more: Tensor) -> Start:
     return Start(latents[0], STATE, POSE, **more)  # type: ignore[arg-type]
 
 
 def test_states_of_alternative_actions_are_integrated_from_the_first_state() -> None:
-    latents, model = truth(), Remembering()
-    compute_rollout(model.rollout, start_of(latents), make_named_actions("left", STEPS, size_m=0.03))
+    latents, model = truth(), RecordingModel()
+    compute_rollout(model.rollout, make_start(latents), make_named_actions("left", STEPS, size_m=0.03))
     context, actions, states, extrinsics = model.given
     assert torch.equal(context, latents[None, :1]), "one frame"
     assert states.shape == actions.shape == (1, STEPS, 7)
@@ -47,23 +47,23 @@ def test_states_of_alternative_actions_are_integrated_from_the_first_state() -> 
 
 
 def test_gripper_changes_are_clipped_to_the_closedness_range() -> None:
-    model = Remembering()
-    compute_rollout(model.rollout, start_of(truth()), make_named_actions("close", STEPS))
+    model = RecordingModel()
+    compute_rollout(model.rollout, make_start(truth()), make_named_actions("close", STEPS))
     _, actions, states, _ = model.given
     np.testing.assert_allclose(actions[0, :, 6].numpy(), [0.1, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(states[0, :, 6].numpy(), [0.9, 1, 1, 1], atol=1e-6)
 
 
 def test_camera_pose_of_the_first_frame_is_used_for_all_steps() -> None:
-    model, camera = Remembering(), torch.arange(6.0)
-    compute_rollout(model.rollout, start_of(truth(), extrinsics=camera), make_named_actions("none", STEPS))
+    model, camera = RecordingModel(), torch.arange(6.0)
+    compute_rollout(model.rollout, make_start(truth(), extrinsics=camera), make_named_actions("none", STEPS))
     assert torch.equal(model.given[3], camera.expand(1, STEPS, 6))
 
 
 def test_recorded_states_are_passed_unchanged() -> None:
-    model, actions = Remembering(), make_named_actions("up", STEPS)
+    model, actions = RecordingModel(), make_named_actions("up", STEPS)
     states = integrate_states(STATE, actions)[:-1] + 0.5
-    compute_rollout(model.rollout, start_of(truth()), actions, states)
+    compute_rollout(model.rollout, make_start(truth()), actions, states)
     np.testing.assert_allclose(model.given[2][0].numpy(), states, atol=1e-6)
 
 

@@ -16,7 +16,7 @@ from vjepa2_ac.goals.key_frames import (
 )
 
 
-def way(*parts: tuple[int, float, float]) -> np.ndarray:
+def make_states(*parts: tuple[int, float, float]) -> np.ndarray:
     """Return states: so many frames each, along which x changes by metres and the gripper by closedness, evenly."""
     x, grip = [0.4], [0.0]
     for frames, metres, closes in parts:
@@ -27,7 +27,7 @@ def way(*parts: tuple[int, float, float]) -> np.ndarray:
     return states
 
 
-def named(states: np.ndarray) -> list[tuple[int, str]]:
+def find_frames_and_names(states: np.ndarray) -> list[tuple[int, str]]:
     return [(key.frame, key.name) for key in find_gripper_key_frames(states)]
 
 
@@ -57,7 +57,7 @@ CASES = {
 
 @pytest.mark.parametrize(("parts", "keys"), CASES.values(), ids=CASES)
 def test_key_frames_are_gripper_changes_and_stops(parts: tuple, keys: list) -> None:
-    assert named(way(*parts)) == keys
+    assert find_frames_and_names(make_states(*parts)) == keys
 
 
 @given(
@@ -66,7 +66,7 @@ def test_key_frames_are_gripper_changes_and_stops(parts: tuple, keys: list) -> N
     )
 )
 def test_key_frames_are_ascending_few_and_exclude_the_start(parts: list) -> None:
-    states = way(*parts)
+    states = make_states(*parts)
     states[:, 6] = np.abs((states[:, 6] + 1) % 2 - 1)  # to and fro between 0 and 1
     for rule in (None, MODEL_STEP_RULE):
         frames = [key.frame for key in find_gripper_key_frames(states, rule)]
@@ -94,7 +94,7 @@ def test_added_frames_keep_key_frames_and_the_step(gaps: list[int], step: int) -
 
 
 def test_goals_have_durations_and_gripper_modes_of_the_demonstration() -> None:
-    states = way((10, 0.2, 0), (5, 0, 0.5), (21, 0.2, 0))
+    states = make_states((10, 0.2, 0), (5, 0, 0.5), (21, 0.2, 0))
     keys = find_gripper_key_frames(states)
     images = [np.full((16, 16, 3), place, np.uint8) for place in range(len(keys))]
     goals = make_sub_goals(images, keys, Timing(stride=4, slack=2, share=0.5), states)

@@ -16,7 +16,7 @@ HERE = Path(__file__).parent
 EXAMPLES = ROOT / "examples/judge"
 
 
-def ran(python: str | Path, script: str, folder: Path, **environment: str) -> dict:
+def run_script(python: str | Path, script: str, folder: Path, **environment: str) -> dict:
     """Run a script of this folder, which writes found.json into a folder."""
     done = subprocess.run(
         [python, HERE / script, folder], capture_output=True, text=True, env={**os.environ, **environment}, timeout=120
@@ -37,7 +37,7 @@ def test_stable_worldmodel_solver_plans_with_this_model(tmp_path: Path) -> None:
     chunks = np.random.default_rng(0).normal(0, 0.02, (5, 2, 7))
     np.savez(tmp_path / "given.npz", image=image(0), goal=image(100), state=STATE, chunks=chunks)
     paths = os.pathsep.join([str(tmp_path / "site"), str(EXAMPLES), str(ROOT / "tests/support"), str(ROOT / "src")])
-    found = ran(sys.executable, "in_stable_worldmodel.py", tmp_path, PYTHONPATH=paths)
+    found = run_script(sys.executable, "in_stable_worldmodel.py", tmp_path, PYTHONPATH=paths)
     np.testing.assert_allclose(found["costs"][1], own.score(image(0), STATE, chunks).energies, rtol=1e-5)
     assert found["shape"] == [2, 5]
     assert found["is_costable"]

@@ -28,11 +28,11 @@ from vjepa2_ac.spaces import apply_actions
 TURN = Axes(math.radians(43.0))
 
 
-def some(*shape: int, seed: int = 0) -> torch.Tensor:
+def random_numbers(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed)) * 0.8
 
 
-def write(path: Path, model: WorldModel, degrees: float = 43.0, **changes: Any) -> str:
+def write_axes(path: Path, model: WorldModel, degrees: float = 43.0, **changes: Any) -> str:
     values = {
         "format": 1,
         **{name: {"value": one, "low": one - 1, "high": one + 1} for name, one in
@@ -48,7 +48,7 @@ def write(path: Path, model: WorldModel, degrees: float = 43.0, **changes: Any) 
 
 def test_rotated_actions_lead_to_rotated_states() -> None:
     """What the model sees is a world like the robot's, only turned: acting and turning can be done in either order."""
-    states, tried = some(50, 7), some(50, 7, seed=1) - 0.4
+    states, tried = random_numbers(50, 7), random_numbers(50, 7, seed=1) - 0.4
     torch.testing.assert_close(
         apply_actions(TURN.rotate_poses(states), TURN.rotate_actions(tried)),
         TURN.rotate_poses(apply_actions(states, tried)),
@@ -86,7 +86,7 @@ def test_limits_apply_to_executed_actions_with_calibrated_axes(tmp_path: Path) -
     model = tiny_model()
     limits = LimitsConfig(xyz=(0.05, 0.002, 0.05))
     plans = []
-    for axes in (None, write(tmp_path / "axes.json", model)):
+    for axes in (None, write_axes(tmp_path / "axes.json", model)):
         run = controller(model, axes=axes, limits=limits)
         run.reset(image(100))
         found = np.stack([run.act(image(seed), STATE) for seed in range(3)])
@@ -105,7 +105,7 @@ def test_limits_apply_to_executed_actions_with_calibrated_axes(tmp_path: Path) -
 )
 def test_unusable_axes_file_raises(tmp_path: Path, changes: dict, complaint: str) -> None:
     model = tiny_model()
-    path = write(tmp_path / "axes.json", model, **changes)
+    path = write_axes(tmp_path / "axes.json", model, **changes)
     with pytest.raises(InputError, match=f"(?s)planning.axes.*{complaint}"):
         controller(model, axes=path)
 
@@ -115,7 +115,7 @@ def test_axes_of_another_model_or_missing_file_raise(tmp_path: Path) -> None:
     with torch.no_grad():
         other.base_predictor.predictor_proj.weight.add_(0.1)
     with pytest.raises(InputError, match="calibrated for another model, tiny"):
-        controller(model, axes=write(tmp_path / "axes.json", other))
+        controller(model, axes=write_axes(tmp_path / "axes.json", other))
     with pytest.raises(InputError, match=r"no/axes\.json: cannot be read"):
         controller(model, axes="no/axes.json")
 
@@ -124,8 +124,8 @@ def test_run_accepts_axes_calibrated_for_its_trained_weights(make_config: Any, t
     config: Config = make_config(planning={"samples": 12, "iterations": 2})
     run = write_adapted_run(config)
     loaded = load_subject(run)
-    path = write(tmp_path / "axes.json", loaded.world_model)
-    for_base = write(tmp_path / "base.json", WorldModel.from_pretrained(str(config.model.base)))
+    path = write_axes(tmp_path / "axes.json", loaded.world_model)
+    for_base = write_axes(tmp_path / "base.json", WorldModel.from_pretrained(str(config.model.base)))
     session = load_for_planning(str(run), overrides=[f"planning.axes={path}"])
     Controller.of_subject(session)
     Controller.of_run(loaded, config.planning.model_copy(update={"axes": path}))
@@ -138,5 +138,5 @@ def test_calibration_output_can_be_read(tmp_path: Path) -> None:
     fit = fit_axes(np.tile(errors, (40, 1)), [f"{place // 4}" for place in range(40)])
     assert fit.problem is None
     model = tiny_model()
-    path = write(tmp_path / "axes.json", model, **json.loads(json.dumps(fit.as_dict())))
+    path = write_axes(tmp_path / "axes.json", model, **json.loads(json.dumps(fit.as_dict())))
     assert read_axes(path).yaw_degrees == pytest.approx(90.0, abs=1e-4)

@@ -37,7 +37,7 @@ def why(run: Controller, frame: np.ndarray, state: np.ndarray = STATE) -> str:
     return run.decision.why
 
 
-def covered(noise: float, seed: int = 0) -> np.ndarray:
+def covered_lens(noise: float, seed: int = 0) -> np.ndarray:
     """Return the image of a covered lens: dark, brighter in the middle, with the noise of a sensor, as JPEG."""
     rng, (rows, columns) = np.random.default_rng(seed), np.mgrid[-1:1:180j, -1:1:320j]
     level = 12 - 1.5 * (rows**2 + columns**2)
@@ -53,7 +53,7 @@ def scene() -> np.ndarray:
 
 @pytest.mark.parametrize("noise", [0.0, 2.0, 10.0])
 def test_covered_lens_with_noise_is_a_uniform_frame(noise: float) -> None:
-    assert is_uniform(covered(noise))
+    assert is_uniform(covered_lens(noise))
     for level in (0, 90, 255):
         assert is_uniform(np.full((180, 320, 3), level, np.uint8))
     assert is_uniform(np.full((180, 320, 3), (0, 140, 30), np.uint8)), "a decoder that failed"

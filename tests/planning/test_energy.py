@@ -216,7 +216,7 @@ ASKING = {
 """What fetches numbers, has a result whose size depends on them, or brings a list of them to the device."""
 
 
-class Recorder(TorchDispatchMode):
+class OperationRecorder(TorchDispatchMode):
     """Records the names of all operations."""
 
     def __init__(self) -> None:
@@ -228,10 +228,10 @@ class Recorder(TorchDispatchMode):
         return operation(*given, **(named or {}))
 
 
-def operations_of(work: Callable[[], object]) -> set[str]:
+def record_operations(work: Callable[[], object]) -> set[str]:
     """Return what runs in something that was done once before."""
     work()
-    with Recorder() as recorder:
+    with OperationRecorder() as recorder:
         work()
     return recorder.seen
 
@@ -242,7 +242,7 @@ def test_energies_are_computed_without_device_synchronisation(steps: str, kind: 
     measure, tried = cost(tiny_model(), samples_at_once=4, steps=steps, distance=kind), actions(10, 3)
     reported: list[tuple[int, int]] = []
     measure.progress = lambda *progress: reported.append(progress)
-    seen = operations_of(lambda: measure(tried))
+    seen = record_operations(lambda: measure(tried))
     assert reported == 2 * [(4, 10), (8, 10), (10, 10)]
     assert "addmm" in seen
     assert not seen & ASKING

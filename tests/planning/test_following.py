@@ -23,13 +23,13 @@ def controller(**changes: object) -> Controller:
     return tiny_controller(seed=3, **{"horizon": 1, **changes})
 
 
-def noisy(seed: int, most: int = 6) -> np.ndarray:
+def noisy_image(seed: int, most: int = 6) -> np.ndarray:
     """Return an image as a camera with noise sees it."""
     noise = np.random.default_rng(99).integers(-most, most + 1, (60, 48, 3))
     return (image(seed) + noise).clip(0, 255).astype(np.uint8)
 
 
-def decided(run: Controller, seen: np.ndarray) -> tuple[int, int, bool, bool]:
+def decide(run: Controller, seen: np.ndarray) -> tuple[int, int, bool, bool]:
     """Return which goal applies, since when, whether it changed, and whether all is done."""
     run.act(seen, STATE)
     return (
@@ -43,23 +43,23 @@ def decided(run: Controller, seen: np.ndarray) -> tuple[int, int, bool, bool]:
 def test_next_goal_applies_once_the_image_is_near_the_current_goal() -> None:
     run = controller()
     run.follow([SubGoal(image(100), at_least=2, at_most=6, share=0.5), SubGoal(image(101))])
-    assert decided(run, image(0)) == (0, 0, False, False)
-    assert decided(run, noisy(100)) == (0, 0, False, False), "not before its time"
-    assert decided(run, image(1)) == (0, 0, False, False)
-    assert decided(run, noisy(100)) == (1, 3, True, False)
-    assert decided(run, image(2)) == (1, 3, False, False)
-    assert run.decision.progress.initial_energy == pytest.approx(begun(run, noisy(100), 101), rel=1e-5)
+    assert decide(run, image(0)) == (0, 0, False, False)
+    assert decide(run, noisy_image(100)) == (0, 0, False, False), "not before its time"
+    assert decide(run, image(1)) == (0, 0, False, False)
+    assert decide(run, noisy_image(100)) == (1, 3, True, False)
+    assert decide(run, image(2)) == (1, 3, False, False)
+    assert run.decision.progress.initial_energy == pytest.approx(compute_energy(run, noisy_image(100), 101), rel=1e-5)
 
 
-def begun(run: Controller, seen: np.ndarray, goal: int) -> float:
+def compute_energy(run: Controller, seen: np.ndarray, goal: int) -> float:
     return float((run.encode(seen) - run.encode(image(goal))).abs().mean())
 
 
 def test_noisy_goal_image_reaches_the_goal_permanently() -> None:
     run, goals = controller(), [SubGoal(image(100), share=0.5)]
     run.follow(goals)
-    assert decided(run, image(0)) == (0, 0, False, False)
-    assert not run.act(noisy(100), STATE).any()
+    assert decide(run, image(0)) == (0, 0, False, False)
+    assert not run.act(noisy_image(100), STATE).any()
     assert (run.decision.why, run.decision.is_done, run.decision.plan) == ("at the goal", True, None)
     assert "below 50%" in run.decision.progress.changed
     assert not run.act(image(1), STATE).any(), "only a reset begins again"
@@ -68,7 +68,7 @@ def test_noisy_goal_image_reaches_the_goal_permanently() -> None:
     plain = controller()
     plain.reset(image(100))
     plain.act(image(0), STATE)
-    assert plain.act(noisy(100), STATE).any(), "without the rule, only an equal image is the goal"
+    assert plain.act(noisy_image(100), STATE).any(), "without the rule, only an equal image is the goal"
 
 
 def test_each_goal_has_its_own_gripper_mode() -> None:
@@ -108,7 +108,7 @@ def test_invalid_goals_raise_and_leave_the_controller_unchanged(goals: list[SubG
     with pytest.raises(InputError, match=wrong):
         run.follow(goals)
     assert run.decision is before
-    assert decided(run, image(1)) == (0, 0, False, False)
+    assert decide(run, image(1)) == (0, 0, False, False)
     with pytest.raises(ValueError, match="no goal"):
         run.follow([])
 
@@ -121,8 +121,8 @@ def test_example_of_the_planning_guide_runs(tmp_path: Path) -> None:
     exec(  # noqa: S102 - our own page
         example.replace("goals/pick", str(tmp_path)), {"controller": run, "grasped": image(100), "placed": image(101)}
     )
-    assert decided(run, image(0)) == (0, 0, False, False)
-    assert decided(run, image(100)) == (1, 1, True, False), "by the share that the example gives"
+    assert decide(run, image(0)) == (0, 0, False, False)
+    assert decide(run, image(100)) == (1, 1, True, False), "by the share that the example gives"
 
 
 def test_gripper_mode_without_gripper_or_free_component_raises() -> None:
@@ -134,7 +134,7 @@ def test_gripper_mode_without_gripper_or_free_component_raises() -> None:
         held.follow([SubGoal(image(100), gripper="held")])
 
 
-def rule(*given: object, **named: object) -> SubGoal:
+def sub_goal(*given: object, **named: object) -> SubGoal:
     """Return a goal of which only the rule counts."""
     return SubGoal(np.zeros(0), *given, **named)
 
@@ -152,17 +152,17 @@ bounds = st.tuples(st.integers(1, 4), st.integers(0, 4))
 
 
 @st.composite
-def courses(draw: st.DrawFn) -> tuple[list[SubGoal], list[list[float]]]:
+def goal_sequences(draw: st.DrawFn) -> tuple[list[SubGoal], list[list[float]]]:
     """Rules of some goals, and the energies of as many images as they need at most, and more."""
     some = draw(st.lists(st.tuples(bounds, st.none() | st.floats(0.05, 0.95)), min_size=1, max_size=4))
-    rules = [rule("", low, low + more, share) for (low, more), share in some]
-    rules.append(rule(share=draw(st.none() | st.floats(0.05, 0.95))))
+    rules = [sub_goal("", low, low + more, share) for (low, more), share in some]
+    rules.append(sub_goal(share=draw(st.none() | st.floats(0.05, 0.95))))
     steps = sum(goal.at_most or 0 for goal in rules) + 3
     row = st.lists(numbers, min_size=len(rules), max_size=len(rules))
     return rules, draw(st.lists(row, min_size=steps, max_size=steps))
 
 
-@given(courses())
+@given(goal_sequences())
 def test_goal_index_never_decreases_and_steps_are_within_bounds(course: tuple) -> None:
     rules, energies = course
     found = progress_over(rules, energies)
@@ -176,7 +176,7 @@ def test_goal_index_never_decreases_and_steps_are_within_bounds(course: tuple) -
         assert after.start_step == before.start_step or after.goal_index == before.goal_index + 1
 
 
-@given(courses())
+@given(goal_sequences())
 def test_goal_ends_early_only_below_its_energy_share(course: tuple) -> None:
     rules, energies = course
     found = progress_over(rules, energies)
@@ -192,7 +192,7 @@ def test_goal_ends_early_only_below_its_energy_share(course: tuple) -> None:
 
 
 def test_initial_energy_is_measured_when_a_goal_begins() -> None:
-    rules = [rule("grasp", 1, 9, 0.5), rule(share=0.5)]
+    rules = [sub_goal("grasp", 1, 9, 0.5), sub_goal(share=0.5)]
     found = progress_over(rules, [[1.0, 5.0], [0.6, 4.0], [0.4, 3.0], [9.0, 2.0], [9.0, 1.4], [9.0, 9.0]])
     assert [one.goal_index for one in found] == [0, 0, 1, 1, 1, 1]
     assert [one.start_step for one in found] == [0, 0, 2, 2, 2, 2]
@@ -205,7 +205,7 @@ def test_initial_energy_is_measured_when_a_goal_begins() -> None:
 
 def test_nan_energy_does_not_advance_the_goal_before_at_most() -> None:
     nan = float("nan")
-    rules = [rule("", 1, 3, 0.5), rule(share=0.5)]
+    rules = [sub_goal("", 1, 3, 0.5), sub_goal(share=0.5)]
     found = progress_over(rules, [[nan, nan]] * 6)
     assert [one.goal_index for one in found] == [0, 0, 0, 1, 1, 1]
     assert not found[-1].is_done

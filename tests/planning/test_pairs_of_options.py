@@ -144,7 +144,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
             yield Scene(model, {name: str(folder / file) for name, file in files.items()})
 
 
-def tried(scene: Scene, *names: str) -> None:
+def plan_with_options(scene: Scene, *names: str) -> None:
     """Take options through two decisions, `plan` and `score`."""
     config = scene.config(*names)
     planning, controller = config.planning, Controller.of_subject(Subject("tiny", config, scene.model))
@@ -186,7 +186,7 @@ def test_every_pair_of_options_works_or_raises_before_the_first_decision(scene: 
     alone = [sorted(pair) for pair in pairs if pair & ALONE]
     for names in [*alone, *covering([pair for pair in pairs if not pair & ALONE], together)]:
         try:
-            tried(scene, *names)
+            plan_with_options(scene, *names)
         except Exception as error:
             raise AssertionError(f"{', '.join(names)}: {scene.planning(*names)}") from error
 

@@ -103,16 +103,16 @@ VECTORS = {
 def test_vector_run_plans_within_the_motions_of_its_data(make_config, reporter) -> None:
     """Joint angles and a gripper: as many numbers as the data have, and no number changes more than it was taught."""
     folder = train(make_config(**VECTORS, training__steps=1), reporter)
-    taught = json.loads((folder / "changes.json").read_text())["changes"]
+    data_changes = json.loads((folder / "changes.json").read_text())["changes"]
     states = [episode.states for episode in episodes_of(folder)]
     expected = np.percentile(np.abs(np.concatenate([one[2:] - one[:-2] for one in states])), 99, axis=0)
-    np.testing.assert_allclose(taught, expected, rtol=1e-6)
+    np.testing.assert_allclose(data_changes, expected, rtol=1e-6)
     controller = Controller.of_subject(load_for_planning(str(folder)))
     controller.reset(image(0))
     action = controller.act(image(1), states[0][0])
     assert action.shape == (8,)
     assert np.any(action)
-    assert (np.abs(action) <= taught).all()
+    assert (np.abs(action) <= data_changes).all()
     np.testing.assert_allclose(controller.decision.states[1], states[0][0] + action, atol=1e-6)
     limited = Controller.of_subject(load_for_planning(str(folder), overrides=["planning.limits.axes=[0.01]"]))
     limited.reset(image(0))
@@ -160,19 +160,21 @@ def test_merged_run_has_the_dtype_of_its_base_and_fingerprints_of_the_trained_we
     assert reported["dtype"] == "bfloat16"
 
 
-TAUGHT = [0.03, 0.02, 0.01, 0.0, 0.1, 0.2, 0.8]  # metres, radians, closedness
+CHANGES_IN_DATA = [0.03, 0.02, 0.01, 0.0, 0.1, 0.2, 0.8]  # metres, radians, closedness
 
 
 @pytest.fixture
-def taught_run(make_config) -> Path:
+def run_with_data_limits(make_config) -> Path:
     """Return a run that was taught so, within the default gripper's limits."""
     folder = write_adapted_run(make_config(planning=PLANNING))
-    note(folder)
+    write_changes(folder)
     return folder
 
 
-def note(folder: Path, **changes: object) -> None:
-    (folder / "changes.json").write_text(json.dumps({"percentile": 99, "changes": TAUGHT, "narrow": ""} | changes))
+def write_changes(folder: Path, **changes: object) -> None:
+    (folder / "changes.json").write_text(
+        json.dumps({"percentile": 99, "changes": CHANGES_IN_DATA, "narrow": ""} | changes)
+    )
 
 
 def read_warnings(folder: Path, *overrides: str) -> tuple[str, ...]:
@@ -200,8 +202,8 @@ def test_pose_run_records_data_limits_and_plans_within_them(make_config, reporte
     assert np.any(action)
     assert (np.abs(action[:3]) <= noted["changes"][:3]).all()
 
-    taught = PlanningConfig.model_validate({**PLANNING, "limits": {"xyz": "data"}})
-    of_run = Controller.of_run(load_subject(folder), taught)
+    data_changes = PlanningConfig.model_validate({**PLANNING, "limits": {"xyz": "data"}})
+    of_run = Controller.of_run(load_subject(folder), data_changes)
     np.testing.assert_allclose(of_run.space.upper[0, :3], limits, rtol=1e-6)
     asked = EvaluationOptions(overrides=("planning.limits.xyz=data",))
     assert resolve_config(str(folder), asked).planning.limits.xyz == limits
@@ -214,15 +216,15 @@ def test_run_without_recorded_motions_plans_but_rejects_data_limits(make_config,
     for subject in (folder, base_folder):
         with pytest.raises(InputError, match=error):
             load_planning_config(str(subject), overrides=["planning.limits.xyz=data"])
-    taught = PlanningConfig.model_validate({"limits": {"xyz": "data"}})
+    data_changes = PlanningConfig.model_validate({"limits": {"xyz": "data"}})
     with pytest.raises(InputError, match=error):
-        Controller(load_subject(folder).world_model, taught)
+        Controller(load_subject(folder).world_model, data_changes)
 
 
 def test_limits_beyond_the_training_data_are_logged_as_warnings(
-    taught_run: Path, caplog: pytest.LogCaptureFixture
+    run_with_data_limits: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    session = load_for_planning(str(taught_run), overrides=["planning.limits.xyz=[0.05,0.02,0.012]"])
+    session = load_for_planning(str(run_with_data_limits), overrides=["planning.limits.xyz=[0.05,0.02,0.012]"])
     assert len(session.warnings) == 1
     assert "planning.limits.xyz exceeds the motions in the training data of" in session.warnings[0]
     assert "dx 5 (3) cm, dz 1.2 (1) cm (99th percentile" in session.warnings[0]
@@ -230,13 +232,15 @@ def test_limits_beyond_the_training_data_are_logged_as_warnings(
     assert session.as_dict()["warnings"] == list(session.warnings)
     assert [(one.levelno, one.getMessage()) for one in caplog.records] == [(logging.WARNING, session.warnings[0])]
     caplog.clear()
-    Controller.of_run(load_subject(taught_run))
+    Controller.of_run(load_subject(run_with_data_limits))
     assert "dx 5 (3) cm, dy 5 (2) cm, dz 5 (1) cm" in caplog.text
     caplog.clear()
-    assert load_for_planning(str(taught_run), overrides=["planning.limits.xyz=data"]).warnings == ()
+    assert load_for_planning(str(run_with_data_limits), overrides=["planning.limits.xyz=data"]).warnings == ()
     assert not caplog.records
-    note(taught_run, changes=[0.03, 1e-9, 0.00009, *TAUGHT[3:]])
-    assert load_for_planning(str(taught_run), overrides=["planning.limits.xyz=data"]).config.planning.limits.xyz == (
+    write_changes(run_with_data_limits, changes=[0.03, 1e-9, 0.00009, *CHANGES_IN_DATA[3:]])
+    assert load_for_planning(
+        str(run_with_data_limits), overrides=["planning.limits.xyz=data"]
+    ).config.planning.limits.xyz == (
         0.03,
         0,
         0,
@@ -247,22 +251,22 @@ def test_limits_beyond_the_training_data_are_logged_as_warnings(
     ("changes", "complaint"),
     [
         (3, "Expected one number of 0 or more"),
-        ([*TAUGHT[:6], "far"], "Expected one number of 0 or more"),
-        (TAUGHT[:6], "Expected 7 numbers: dx, dy"),
-        ([30.0, *TAUGHT[1:]], "positions in metres"),
+        ([*CHANGES_IN_DATA[:6], "far"], "Expected one number of 0 or more"),
+        (CHANGES_IN_DATA[:6], "Expected 7 numbers: dx, dy"),
+        ([30.0, *CHANGES_IN_DATA[1:]], "positions in metres"),
     ],
 )
-def test_invalid_recorded_motions_raise(taught_run: Path, changes: object, complaint: str) -> None:
-    note(taught_run, changes=changes)
+def test_invalid_recorded_motions_raise(run_with_data_limits: Path, changes: object, complaint: str) -> None:
+    write_changes(run_with_data_limits, changes=changes)
     with pytest.raises(InputError, match=rf"changes\.json: .*{complaint}"):
-        load_for_planning(str(taught_run))
+        load_for_planning(str(run_with_data_limits))
 
 
 def test_vector_limits_are_compared_by_component(make_config) -> None:
     config = make_config(data__states="vector", data__path="elsewhere", planning=PLANNING)
     folder = Path(config.run_dir)
     folder.mkdir()
-    note(folder, changes=[0.1, 0.02], narrow="1 of 2 numbers hardly move, 0 only one way")
+    write_changes(folder, changes=[0.1, 0.02], narrow="1 of 2 numbers hardly move, 0 only one way")
 
     def found(axes: tuple[float, ...]) -> tuple[str, ...]:
         limits = config.planning.limits.model_copy(update={"axes": axes})

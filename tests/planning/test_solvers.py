@@ -167,7 +167,7 @@ def test_unbounded_cost_keeps_the_plan_within_the_limits(planner: str) -> None:
     assert torch.equal(plan.actions[0], plan.actions[1])
 
 
-class Watch:
+class FakeClock:
     """A clock that only a test advances."""
 
     def __init__(self) -> None:
@@ -180,7 +180,7 @@ class Watch:
 @pytest.mark.parametrize("planner", PLANNERS)
 @pytest.mark.parametrize(("budget", "iterations"), [(0.1, 1), (2.9, 2), (3.0, 3), (99.0, 5)])
 def test_iterations_stop_before_the_time_budget_is_exceeded(planner: str, budget: float, iterations: int) -> None:
-    watch = Watch()
+    watch = FakeClock()
 
     def slow(actions: Tensor) -> Tensor:
         watch.time += 1.0 if len(actions) > 1 else 0.0

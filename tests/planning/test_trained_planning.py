@@ -43,7 +43,7 @@ def trained_model(adapter: AdapterConfig, dtype: torch.dtype = torch.float32) ->
     return model.eval()
 
 
-def decided(model: WorldModel, config: PlanningConfig = PLAIN) -> list[np.ndarray]:
+def decide(model: WorldModel, config: PlanningConfig = PLAIN) -> list[np.ndarray]:
     images = np.random.default_rng(0).integers(0, 256, (3, 48, 48, 3), dtype=np.uint8)
     run = Controller(model, config)
     run.reset(images[0])
@@ -57,9 +57,9 @@ def test_merged_model_decides_like_the_trained_model(adapter: AdapterConfig, mon
         expected, of_base = cost(model)(tried), cost(tiny_model())(tried)
         torch.testing.assert_close(cost(prepare_for_planning(model, PLAIN))(tried), expected, rtol=1e-5, atol=0)
     assert (expected - of_base).norm() > 1e-3 * of_base.norm(), "training changed something"
-    found = decided(model)
+    found = decide(model)
     monkeypatch.setattr(controller, "prepare_for_planning", lambda given, _: given)
-    np.testing.assert_allclose(found, decided(model), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(found, decide(model), rtol=0, atol=1e-5)
 
 
 @every_adapter
@@ -108,9 +108,9 @@ def _with_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("planner", ["cem", "gradient"])
 def test_compiled_plans_equal_uncompiled_plans(adapted: bool, planner: str) -> None:
     model, planned = tiny_model(adapted=adapted), {"planner": Component(planner)}
-    expected = decided(model, IN_PARTS.model_copy(update=planned))
+    expected = decide(model, IN_PARTS.model_copy(update=planned))
     assert not counters["stats"]
-    found = decided(model, COMPILED.model_copy(update=planned))
+    found = decide(model, COMPILED.model_copy(update=planned))
     assert counters["stats"]["unique_graphs"]
     assert not counters["graph_break"]
     np.testing.assert_allclose(found, expected, atol=1e-6)

@@ -23,7 +23,7 @@ from vjepa2_ac.simulation.camera import FRAME_SIZE
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
 
-def decided(goal: np.ndarray, frame: np.ndarray, views: int, mask: np.ndarray | None = None) -> Controller:
+def decide(goal: np.ndarray, frame: np.ndarray, views: int, mask: np.ndarray | None = None) -> Controller:
     run = controller(views=views, limits=LimitsConfig(rotation=0.1))
     run.reset(goal, mask=mask)
     run.act(frame, STATE)
@@ -38,13 +38,13 @@ def energies(run: Controller, actions: torch.Tensor) -> torch.Tensor:
 def test_energy_of_two_views_is_the_mean_of_both() -> None:
     goals, frames = (image(100), image(101)), (image(1), image(2))
     actions = torch.randn(5, 2, 7, generator=torch.Generator().manual_seed(0)) * 0.05
-    both = decided(np.hstack(goals), np.hstack(frames), 2)
-    alone = [energies(decided(goal, frame, 1), actions) for goal, frame in zip(goals, frames, strict=True)]
+    both = decide(np.hstack(goals), np.hstack(frames), 2)
+    alone = [energies(decide(goal, frame, 1), actions) for goal, frame in zip(goals, frames, strict=True)]
     torch.testing.assert_close(energies(both, actions), torch.stack(alone).mean(dim=0))
     predicted, states = both.decision.cost.rollout(actions)
     tokens = tiny_model().num_tokens
     for number, (goal, frame) in enumerate(zip(goals, frames, strict=True)):
-        of_one, the_same = decided(goal, frame, 1).decision.cost.rollout(actions)
+        of_one, the_same = decide(goal, frame, 1).decision.cost.rollout(actions)
         torch.testing.assert_close(predicted[:, :, number * tokens : (number + 1) * tokens], of_one)
         torch.testing.assert_close(states, the_same)
 
@@ -54,16 +54,16 @@ def test_mask_can_exclude_one_view() -> None:
     mask = np.zeros(goal.shape[:2], dtype=bool)
     mask[:, : mask.shape[1] // 2] = True
     actions = torch.zeros(1, 2, 7)
-    left = energies(decided(image(100), image(1), 1), actions)
-    torch.testing.assert_close(energies(decided(goal, frame, 2, mask), actions), left)
+    left = energies(decide(image(100), image(1), 1), actions)
+    torch.testing.assert_close(energies(decide(goal, frame, 2, mask), actions), left)
     with pytest.raises(InputError, match="no pixel inside the cropped image"):
-        decided(goal, frame, 2, np.zeros_like(mask))
+        decide(goal, frame, 2, np.zeros_like(mask))
 
 
 def test_image_width_that_does_not_fit_the_views_raises() -> None:
     odd = np.zeros((64, 65, 3), dtype=np.uint8)
     with pytest.raises(InputError, match=r"65 pixels wide.* 2 views share"):
-        decided(odd, odd, 2)
+        decide(odd, odd, 2)
 
 
 def test_goals_and_video_contain_both_cameras(tmp_path: Path) -> None:

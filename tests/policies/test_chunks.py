@@ -14,7 +14,7 @@ from vjepa2_ac.policies.score import changes_of_chunks
 from vjepa2_ac.spaces import actions_from_states, apply_action, make_vector_states
 
 
-def walks(seed: int, steps: int = 12) -> np.ndarray:
+def random_walks(seed: int, steps: int = 12) -> np.ndarray:
     """Return the states after each control step of three chunks; the gripper stays within its limits."""
     rng = np.random.default_rng(seed)
     found = []
@@ -30,7 +30,7 @@ def walks(seed: int, steps: int = 12) -> np.ndarray:
 @settings(max_examples=15)
 @given(st.integers(0, 30), st.sampled_from([1, 3, 4]))
 def test_every_chunk_form_gives_the_same_changes(seed: int, control_steps: int) -> None:
-    targets = walks(seed)
+    targets = random_walks(seed)
     deltas = np.stack([actions_from_states(np.concatenate([STATE[None], one])) for one in targets])
     offsets = np.array([[actions_from_states(np.stack([STATE, one]))[0] for one in way] for way in targets])
     wanted = [

@@ -94,7 +94,7 @@ def test_monitor_command_detects_a_corrupted_image(
 # ---- the surprise of a frame, and the threshold ----
 
 
-def written(folder: Path, threshold: float) -> str:
+def write_monitor(folder: Path, threshold: float) -> str:
     known = tiny_model().fingerprints()
     usual = (0.0,) * tiny_model().num_tokens
     monitor = Monitor("vjepa2-ac monitor 1", threshold, 0.1, 8, (threshold,), usual, known.encoder, known.predictor)
@@ -102,7 +102,7 @@ def written(folder: Path, threshold: float) -> str:
     return str(folder / MONITOR)
 
 
-def acting(monitor: str | None, frames: int = 4, **changes: object) -> list:
+def run_controller(monitor: str | None, frames: int = 4, **changes: object) -> list:
     run = Controller(tiny_model(), QUICK.model_copy(update={"monitor": monitor, "horizon": 3, **changes}))
     run.reset(image(100))
     found = []
@@ -134,36 +134,36 @@ def test_surprise_is_the_mean_excess_over_the_usual_error() -> None:
 
 
 def test_nan_surprise_is_an_alarm(tmp_path: Path) -> None:
-    monitor = Monitor.read(written(tmp_path, 9.0), tiny_model().fingerprints(), tokens=9, where="test")
+    monitor = Monitor.read(write_monitor(tmp_path, 9.0), tiny_model().fingerprints(), tokens=9, where="test")
     still = torch.zeros(9, 5)
     assert not monitor.compare(still, still).is_alarm
     assert monitor.compare(still, torch.full_like(still, float("nan"))).is_alarm
 
 
 def test_monitor_compares_the_last_prediction_with_the_current_frame(tmp_path: Path) -> None:
-    first, second, *_ = acting(written(tmp_path, 1e6))
+    first, second, *_ = run_controller(write_monitor(tmp_path, 1e6))
     assert first.surprise is None
     predicted, _ = first.cost.rollout(first.plan.actions[None, :1])
     expected = (predicted[0, 0] - second.cost.current[0]).abs().mean(dim=-1)
     np.testing.assert_allclose(second.surprise.errors, expected, rtol=1e-5)
     assert not second.surprise.is_alarm
-    assert acting(written(tmp_path, 1e-6))[1].surprise.is_alarm
-    assert all(one.surprise is None for one in acting(None))
+    assert run_controller(write_monitor(tmp_path, 1e-6))[1].surprise.is_alarm
+    assert all(one.surprise is None for one in run_controller(None))
 
 
 def test_mismatched_monitor_settings_and_files_raise(tmp_path: Path) -> None:
-    path = written(tmp_path, 1.0)
+    path = write_monitor(tmp_path, 1.0)
     known = json.loads(Path(path).read_text())
     Path(path).write_text(json.dumps(known | {"predictor": "0" * 64}))
     with pytest.raises(InputError, match="another model"):
-        acting(path)
+        run_controller(path)
     Path(path).write_text(json.dumps(known | {"threshold": None}))
     with pytest.raises(InputError, match="threshold"):
-        acting(path)
+        run_controller(path)
 
 
 def test_server_reports_an_alarm_in_its_reply_and_counts_it(tmp_path: Path) -> None:
-    config = QUICK.model_copy(update={"monitor": written(tmp_path, 1e-6)})
+    config = QUICK.model_copy(update={"monitor": write_monitor(tmp_path, 1e-6)})
     session = Session(Controller(tiny_model(), config))
     answers = []
     for seed in range(2):

@@ -44,7 +44,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "prior"
 
 
-def acting(folder: Path | None, **changes: object) -> Controller:
+def make_controller(folder: Path | None, **changes: object) -> Controller:
     config = QUICK.model_copy(update={"prior": folder and str(folder), **changes})
     run = Controller(tiny_model(), config)
     run.reset(image(100))
@@ -53,7 +53,7 @@ def acting(folder: Path | None, **changes: object) -> Controller:
 
 
 def test_prior_planner_acts_within_the_limits_without_search(folder: Path) -> None:
-    run = acting(folder, planner=Component("prior"), limits=LimitsConfig(xyz=(0.05, 0.01, 0.05)))
+    run = make_controller(folder, planner=Component("prior"), limits=LimitsConfig(xyz=(0.05, 0.01, 0.05)))
     np.testing.assert_allclose(run.decision.action, [0.03, -0.01, 0.01, 0, 0, 0, 0.3], atol=1e-6)
     assert run.decision.plan.evaluations == 1
     assert run.decision.why == "planned"
@@ -61,16 +61,16 @@ def test_prior_planner_acts_within_the_limits_without_search(folder: Path) -> No
 
 @pytest.mark.parametrize("planner", ["cem", "icem", "mppi", "gradient"])
 def test_search_starts_from_the_mean_and_std_of_the_prior(folder: Path, planner: str) -> None:
-    run = acting(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
+    run = make_controller(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
     first = run.decision.plan.iterations[0]
     spread = np.sqrt(2) * np.exp(-3.0)
     far = (first.elites[:, 0, :3] - torch.tensor(MEAN[:3])).abs().max()
     assert far <= 5 * spread
     if planner in {"cem", "icem"}:
         assert not torch.allclose(
-            first.mean, acting(None, planner=Component(planner), iterations=1, horizon=1).space.lower
+            first.mean, make_controller(None, planner=Component(planner), iterations=1, horizon=1).space.lower
         )
-    again = acting(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
+    again = make_controller(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
     np.testing.assert_array_equal(run.decision.action, again.decision.action)
 
 
@@ -79,7 +79,7 @@ def test_prior_of_several_steps_uses_predicted_frames(tmp_path: Path) -> None:
     prior, model = ActionPrior(SIZES).eval().requires_grad_(False), tiny_model()
     card = PriorCard("vjepa2-ac prior 1", SIZES, model.encoder_fingerprint(), "released", "nowhere", 0)
     save_prior(tmp_path / "prior", card, prior)
-    run = acting(
+    run = make_controller(
         tmp_path / "prior",
         planner=Component("prior"),
         horizon=3,
@@ -99,7 +99,7 @@ def test_prior_of_another_encoder_or_damaged_file_raises(folder: Path) -> None:
     card = json.loads((folder / CARD).read_text())
     (folder / CARD).write_text(json.dumps(card | {"encoder": "0" * 64}))
     with pytest.raises(InputError, match=r"a prior for encoder"):
-        acting(folder)
+        make_controller(folder)
     (folder / CARD).write_text(json.dumps(card | {"sizes": {**card["sizes"], "dim": -1}}))
     with pytest.raises(InputError, match="dim"):
         load_prior(folder, where="planning.prior")

@@ -50,7 +50,7 @@ def policy(dataset: Dataset, name: str, noise: float, chunks: int = 3, steps: in
     return PolicyChunks(name, tuple(places), np.array(found))
 
 
-class Knowing(Controller):
+class OracleController(Controller):
     """Its energy is the distance to the true actions, which are the first of all that it is asked for."""
 
     is_blind = False
@@ -64,15 +64,15 @@ class Knowing(Controller):
         return ChunkScores(far + 0.1, still + 0.1, 1.0, 0)
 
 
-def knowing(*, blind: bool = False) -> Controller:
-    run = Knowing(tiny_model(), PlanningConfig())
+def oracle_controller(*, blind: bool = False) -> Controller:
+    run = OracleController(tiny_model(), PlanningConfig())
     run.is_blind = blind
     return run
 
 
 def test_policies_of_known_quality_are_ranked_correctly(dataset: Dataset) -> None:
     policies = [policy(dataset, name, noise) for name, noise in (("bad", 1.0), ("good", 0.05), ("fair", 0.3))]
-    found = score_policies(knowing(), dataset, policies)
+    found = score_policies(oracle_controller(), dataset, policies)
     assert [one.name for one in found.policies] == ["good", "fair", "bad"]
     assert (found.places, found.episodes, found.left_out) == (2 * EPISODES, EPISODES, EPISODES)
     assert not found.is_blind
@@ -85,12 +85,12 @@ def test_policies_of_known_quality_are_ranked_correctly(dataset: Dataset) -> Non
 
 
 def test_model_at_chance_is_blind(dataset: Dataset) -> None:
-    found = score_policies(knowing(blind=True), dataset, [policy(dataset, "one", 0.1)])
+    found = score_policies(oracle_controller(blind=True), dataset, [policy(dataset, "one", 0.1)])
     assert found.is_blind
     assert found.others_below_true.low < 0.5
 
 
-class Noting(Knowing):
+class RecordingController(OracleController):
     """Notes what it is asked for."""
 
     def score(self, frame: np.ndarray, state: np.ndarray, chunks: np.ndarray) -> ChunkScores:
@@ -99,7 +99,7 @@ class Noting(Knowing):
 
 
 def test_alternative_actions_are_from_other_episodes(dataset: Dataset) -> None:
-    run, one = Noting(tiny_model(), PlanningConfig()), policy(dataset, "one", 0.1)
+    run, one = RecordingController(tiny_model(), PlanningConfig()), policy(dataset, "one", 0.1)
     score_policies(run, dataset, [one])
     episodes = [name for name, step in sorted(one.points) if step < STEPS - 1]
     true = np.stack([chunks[0] for chunks in run.chunks])
@@ -120,7 +120,7 @@ def test_views_are_read_side_by_side_as_in_planning(tmp_path: Path) -> None:
     how = {"source": "npz", "frames": 3, "stride": STRIDE, "workers": 0}
     both = open_dataset(tmp_path, camera=("frames", "right"), **how)
     one = PolicyChunks("one", ((both.table.identity(1), 3),), np.zeros((1, 1, 4, 7)) + 0.4)
-    run = Noting(tiny_model(), PlanningConfig(views=2))
+    run = RecordingController(tiny_model(), PlanningConfig(views=2))
     score_policies(run, both, [one])
     expected = [both.source.read(1, camera).read_frames([3])[0] for camera in ("frames", "right")]
     np.testing.assert_array_equal(run.frames[0], np.hstack(expected))
@@ -131,11 +131,11 @@ def test_views_are_read_side_by_side_as_in_planning(tmp_path: Path) -> None:
 def test_points_missing_in_a_file_are_skipped_and_unknown_episodes_raise(dataset: Dataset) -> None:
     one, other = policy(dataset, "one", 0.1), policy(dataset, "other", 0.1)
     fewer = PolicyChunks("other", other.points[:2], other.chunks[:2])
-    assert score_policies(knowing(), dataset, [one, fewer]).places == 2
+    assert score_policies(oracle_controller(), dataset, [one, fewer]).places == 2
     with pytest.raises(InputError, match="no common evaluation point"):
-        score_policies(knowing(), dataset, [one, PolicyChunks("none", (("x", 0),), other.chunks[:1])])
+        score_policies(oracle_controller(), dataset, [one, PolicyChunks("none", (("x", 0),), other.chunks[:1])])
     with pytest.raises(InputError, match="has no such episode"):
-        score_policies(knowing(), dataset, [PolicyChunks("none", (("x", 0),), other.chunks[:1])])
+        score_policies(oracle_controller(), dataset, [PolicyChunks("none", (("x", 0),), other.chunks[:1])])
 
 
 def test_policy_files_are_read_without_executing_code(tmp_path: Path) -> None:
