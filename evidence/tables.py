@@ -19,7 +19,8 @@ from vjepa2_ac.intervals import estimate_mean, estimate_share
 FEWEST = 20  # cells of a correlation
 SHORT = ("zero-shot", AXES, BEST, LONGER, "full", "scratch", "scratch, 3x steps")  # rows of the short table
 Correlated = dict[str, tuple[int, dict[str, dict[str, float]]]]  # by change: number of cells, and an interval by name
-SHOWN_TASKS = ("Lift", "LIBERO-object")  # the tasks in which methods differ; the page has one sentence about the others
+SHOWN_TASKS = {"Lift": "Lift", "LIBERO-object": "LIBERO-Spatial, objects changed"}
+"""The tasks in which methods differ, and their titles. The page has one sentence about the others."""
 MARKS = {name: f"{name}, made by `make evidence`" for name in ("success", "metrics", "environments")}
 OFFLINE = {  # numbers in the short table of correlations
     "cost of wrong actions, negative": "growth of the one-step error with shuffled actions",
@@ -81,7 +82,7 @@ def summary_of_tasks(results: Sequence[Figures]) -> str:
     """Return the success rate of each method on tasks of third-party environments, with Wilson's interval."""
     tasks = [task for task in SHOWN_TASKS if pick(results, shift=task, method=BEST)]
     goals = [sum(len(reached(one)) for one in main_cells(results, BASES[0], BEST, task)) for task in tasks]
-    heads = [f"{task}, {count} problems" for task, count in zip(tasks, goals, strict=True)]
+    heads = [f"{SHOWN_TASKS[task]}, {count} problems" for task, count in zip(tasks, goals, strict=True)]
     columns = [(BASES[0], task) for task in tasks]
     return _rates(results, (BEFORE, *IN_EVERY_WORLD, FROM_PRIOR), columns, heads) if tasks else ""
 
