@@ -220,7 +220,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_unusable_destination_raises_before_the_export(tmp_path: Path, form: Any) -> None:
     (tmp_path / "there.pt").write_text("precious")
     for place in (tmp_path, tmp_path / "there.pt"):
-        with pytest.raises(InputError, match=r"something is there already|the name of a \.pt file"):
+        with pytest.raises(InputError, match=r"a file with this name exists|not empty|ends in \.pt"):
             export_run(tmp_path / "run", place, form)
     assert (tmp_path / "there.pt").read_text() == "precious"
     with pytest.raises(InputError, match="cannot be written"):

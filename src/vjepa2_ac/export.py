@@ -30,7 +30,7 @@ from vjepa2_ac.storage import (
     atomic_writer,
     check_local_writable,
     folder_writer,
-    is_empty,
+    require_new_folder,
     translate_write_errors,
     write_atomically,
 )
@@ -105,11 +105,10 @@ def export_run(
 def _check_free(destination: Path, form: Form) -> None:
     """Check that a destination is free and can be written. Changes nothing."""
     if destination.suffix == ".pt" and form != "official" and not destination.is_dir():
-        found = "the name of a .pt file"
+        found = "a path that ends in .pt"
         raise InputError(where=str(destination), found=found, needed=f"a folder, for --to {form}")
+    require_new_folder(destination)
     with translate_write_errors(destination):
-        if destination.exists() and not (destination.is_dir() and is_empty(destination)):
-            raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
         check_local_writable(destination)
 
 

@@ -18,7 +18,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, DecoderShape, save_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import evaluate_subject, load_models
-from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, resolve_config
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT
@@ -145,7 +145,7 @@ def test_other_runs_are_measured_on_the_same_latents(run: str, tmp_path: Path, b
 def test_another_encoder_cannot_be_measured_on_these_latents(run: str, tmp_path: Path, base_folder: Path) -> None:
     model = WorldModel.from_pretrained(base_folder)
     WorldModel.random(model.sizes, seed=9).save_pretrained(tmp_path / "other")
-    with pytest.raises(InputError, match=r"another encoder than that of.*vjepa2-ac compare"):
+    with pytest.raises(InputError, match=r"an encoder that differs from that of.*vjepa2-ac compare"):
         evaluate_subject(run, asked(against=(str(tmp_path / "other"),)))
 
 
@@ -206,6 +206,11 @@ def test_model_without_data_and_occupied_output_raise(run: str, tmp_path: Path, 
         evaluate_subject(str(base_folder), asked())
     with pytest.raises(InputError, match="no such folder"):
         evaluate_subject(str(tmp_path / "nowhere"), asked())
+    (tmp_path / "config.yaml").touch()
+    with pytest.raises(InputError, match=r"a config file\. Expected the folder of a run"):
+        evaluate_subject(str(tmp_path / "config.yaml"), asked())
+    with pytest.raises(InputError, match=r"no checkpoint of step 17\. Expected"):
+        resolve_config(run, asked(checkpoint="17"))
     (tmp_path / "file").touch()
     with pytest.raises((InputError, OSError), match="file"):
         evaluate_subject(run, asked(out=tmp_path / "file"))
@@ -248,7 +253,7 @@ def test_a_decoder_adds_rows_and_images_and_changes_nothing_else(
     assert (metrics.of("decoded.psnr_db.whole.truth.3") or added[0]).value > 0  # type: ignore[operator]
     assert "decoded truth" not in capsys.readouterr().out, "it stands behind --all"
     page = (tmp_path / "report.html").read_text()
-    assert "Decoded images against the truth: PSNR (dB), whole image" in page
+    assert "Decoded images compared with the truth: PSNR (dB), whole image" in page
 
 
 def test_from_a_cache_decoded_images_are_compared_with_the_decoded_truth_and_encoded_again(

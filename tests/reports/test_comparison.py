@@ -53,7 +53,7 @@ def test_errors_against_different_base_models_are_not_put_in_one_column(tmp_path
 def test_actions_that_were_ranked_differently_do_not_compare(tmp_path: Path) -> None:
     more = replace(PROBES, samples=12)
     found = compare([written(tmp_path / "a", Halfway()), written(tmp_path / "b", Halfway(), probes=more)])
-    assert any("ranked differently" in note for note in found.notes)
+    assert any("measured with different settings" in note for note in found.notes)
     assert found.next_command == "No run is recommended: the actions were ranked with different settings."
     other_seed = compare([tmp_path / "a", written(tmp_path / "c", Halfway(), ranking_seed=1)])
     assert not other_seed.notes

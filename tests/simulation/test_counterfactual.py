@@ -155,5 +155,5 @@ def test_failed_resimulation_gives_a_note(simulated: Path, film_of, tmp_path: Pa
     data = shutil.copytree(simulated, tmp_path / "data")
     (data / SIMULATION_FILE).write_text("{}")
     found = film_of(data, "up")
-    assert found.notes[-1].startswith("What really happens under other actions is not known: ")
+    assert found.notes[-1].startswith("The true outcome of other actions was not simulated: ")
     assert [one.truth for one in found.rollouts] == [None]

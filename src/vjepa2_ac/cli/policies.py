@@ -94,7 +94,10 @@ def _monitor(options: argparse.Namespace) -> int:
         needed, fix = "1: a monitor is made with one camera", "Add planning.views=1"
         raise InputError(where="planning.views", found=f"{views}", needed=needed, fix=fix)
     if options.out is None and not is_run(options.subject):
-        raise InputError(where="--out", found=f"{options.subject}, a model, and no folder", needed="--out FOLDER")
+        found, needed = "a model, which has no folder for the monitor", "the folder of a run; or a model with --out"
+        raise InputError(
+            where=str(options.subject), found=found, needed=needed, fix="Add --out FOLDER and --data CONFIG"
+        )
     data = None if options.data is None else cli.read_config(options.data)
     folder = Path(options.out or options.subject)
     cli.make_folder(folder)

@@ -12,6 +12,7 @@ from vjepa2_ac.errors import InputError, counted, shell_command
 from vjepa2_ac.process import is_first_process
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.folder import is_run, read_run_config
+from vjepa2_ac.storage import require_new_folder
 
 
 def add_train(commands: cli.Commands) -> None:
@@ -151,6 +152,7 @@ def _export(options: argparse.Namespace) -> None:
     """Export the model of a run, or its adapter."""
     config = read_run_config(options.run, options.overrides)
     cli.require_subject(str(options.run), config, options.words)
+    require_new_folder(options.folder)
 
     from vjepa2_ac.export import export_run
 

@@ -40,7 +40,7 @@ from vjepa2_ac.storage.paths import BUILTIN
 from vjepa2_ac.storage.structured import utc_now
 
 BASE = "base"
-_NO_BASE = "There is no base to compare with: it takes states or actions of other widths than this robot's."
+_NO_BASE = "The base model is not compared: its states or actions have other widths than those of this robot."
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ def load_models(
     evaluated_models: list[EvaluatedModel] = []
     if BASE in against and config.model.is_random:
         if options.against is not None:
-            found, needed = "a model without a base (model.base: random)", "a base to compare with"
+            found, needed = "a model without a base model (model.base: random)", "a base model"
             raise InputError(where="--against base", found=found, needed=needed, fix="Leave out --against base")
     elif BASE in against and not is_of_run:
         base_model = _load_like(name, world_model, config.model.base, config, dataset.widths)
@@ -126,13 +126,16 @@ def _load_like(subject: str, world_model: WorldModel, other: str, config: Config
     """
     where = f"--against {other}"
     if not (other.startswith(BUILTIN) or Path(other).exists()):
-        needed = "base, the folder of a run, or a model: what model.base takes"
+        needed = "base, the folder of a run, or a model in a form that model.base accepts"
         raise InputError(where=where, found="no such file or folder", needed=needed)
     loaded = load_subject(other, config=None if is_run(other) else config).world_model
     same = loaded.image_size == world_model.image_size
     if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():
-        found, needed = f"another encoder than that of {subject}", "the same one: errors are of the same latents"
-        fix = "Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`"
+        found, needed = (
+            f"an encoder that differs from that of {subject}",
+            "the same encoder, since errors compare latents",
+        )
+        fix = "Evaluate each run separately, and compare their errors relative to persistence with `vjepa2-ac compare`"
         raise InputError(where=where, found=found, needed=needed, fix=fix)
     require_widths(loaded, widths, where=where)
     return loaded

@@ -119,7 +119,7 @@ def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservat
             DecodedRollout("model", name, actions, predicted_frames(actions)) for name, actions in chosen.items()
         ),
         notes=(
-            f"Times in the film suppose {_RATE_HZ:g} control steps in a second.",
+            f"Times in the video assume {_RATE_HZ:g} control steps per second.",
             *warnings,
             *describe_poor_reconstruction(decoder.card, first, decoded_first),
         ),
@@ -127,7 +127,7 @@ def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservat
 
 
 def _require_directions(space: StateSpace, *, where: str, fix: str = "") -> None:
-    """Refuse states for which named actions are undefined: vectors, and poses in the camera's frame."""
+    """Check that named actions are defined: not for vectors, and not for poses in the camera frame."""
     if not space.is_base_pose:
         found, needed = (
             "states that are not poses in the robot base frame",
@@ -180,7 +180,7 @@ def imagine_clip(
             for name in chosen.keys() - truths:
                 truths[name] = _as_seen(*outcome(chosen[name]), config=config, size=size)
     except UserError as error:
-        notes = (f"What really happens under other actions is not known: {error}",)
+        notes = (f"The true outcome of other actions was not simulated: {error}",)
     rollouts: list[DecodedRollout] = []
     with accelerator.autocast():
         latents = encode_batch(models.world_model, batch, device=accelerator.device)
@@ -217,7 +217,7 @@ def _actions_of(options: ImagineOptions, batch: Batch, dataset: Dataset, limits:
         if word == TRUE:
             chosen[AS_RECORDED] = recorded
             continue
-        _require_directions(dataset.spaces.state, where=f"--actions {word}", fix="Give --actions true")
+        _require_directions(dataset.spaces.state, where=f"--actions {word}", fix="Use --actions true")
         name = word if word in ACTION_NAMES else Path(word).name  # with its suffix, so that it equals no action name
         chosen[word if name in chosen else name] = _actions_by_name(word, len(recorded), options.size_m, limits)
     return chosen
@@ -232,7 +232,7 @@ def _window(dataset: Dataset, options: ImagineOptions) -> tuple[int, int]:
         if 0 < longest < clip:
             most = (longest - 1) // dataset.config.model_stride
             found = f"{counted(options.steps, 'model step')}, and the longest {split} episode has {most}"
-            raise InputError(where="--steps", found=found, needed=f"{most} at most")
+            raise InputError(where="--steps", found=found, needed=f"at most {most}")
         windows = validation_windows(dataset, split, clips=_SEARCHED)
         return max(windows, key=lambda window: _motion(dataset, *window))
     episode = find_episode(dataset, options.episode)

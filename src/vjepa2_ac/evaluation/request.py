@@ -13,7 +13,7 @@ from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.settings import resolve_data_limits
-from vjepa2_ac.runs.checkpoint import SELECTED
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, SELECTED, checkpoint_name, select_checkpoint
 from vjepa2_ac.runs.folder import is_run, read_run_config, sets_movable_path
 
 
@@ -61,17 +61,26 @@ def resolve_config(subject: str, options: EvaluationOptions) -> Config:
             needed = "keys of planning, such as planning.samples=200; or, for a run, model.base=PATH"
             raise InputError(where="override", found=override, needed=needed)
     config = parse_config(config_as_dict(config), options.overrides, where="overrides")
-    return resolve_data_limits(config, Path(subject)) if is_run(subject) else config
+    if not is_run(subject):
+        return config
+    _require_checkpoint(Path(subject), options.checkpoint)
+    return resolve_data_limits(config, Path(subject))
+
+
+def _require_checkpoint(run: Path, checkpoint: str) -> None:
+    """Check that a requested step exists, before a model is loaded. The files are verified when they are loaded."""
+    if checkpoint.isdecimal() and not (run / CHECKPOINTS / checkpoint_name(int(checkpoint))).is_dir():
+        select_checkpoint(run, checkpoint)  # raises, and lists the existing steps
 
 
 def require_one_process(environment: Mapping[str, str] = os.environ) -> None:
-    """Refuse several processes, each of which would do all of the work and write the same files.
+    """Check that there is one process: several would each do all of the work and write the same files.
 
     Raises:
         InputError: torchrun or `accelerate launch` started several processes.
     """
     if (processes := environment.get("WORLD_SIZE", "1")) != "1":
-        needed = "one: only train, encode and evaluate share their work among processes"
+        needed = "1: only train, encode and evaluate share work between processes"
         fix = "Start the command without torchrun or accelerate launch"
         raise InputError(where="torchrun", found=counted(int(processes), "process"), needed=needed, fix=fix)
 
@@ -81,15 +90,18 @@ def _config_of(subject: str, options: EvaluationOptions) -> Config:
     run_config = read_run_config(Path(subject)) if is_run(subject) else None
     if options.data is None:
         if run_config is None:
+            if Path(subject).is_file() and Path(subject).suffix in {".yaml", ".yml"}:
+                fix = "Pass the folder that run_dir in this config names"
+                raise InputError(where=subject, found="a config file", needed="the folder of a run", fix=fix)
             raise InputError(
                 where=subject,
                 found="no config.yaml: not the folder of a run" if Path(subject).exists() else "no such folder",
-                needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
-                fix="To measure a model, name the data with --data CONFIG and a folder with --out",
+                needed="the folder of a run, which `vjepa2-ac train CONFIG` creates",
+                fix="To evaluate a model, add --data CONFIG and --out FOLDER",
             )
         return run_config
     if options.out is None:
-        found, needed = "metrics.json of a run's own folder is for its own data", "a folder for what is found on these"
+        found, needed = "no output folder", "--out: metrics.json in a run's folder belongs to the run's own data"
         raise InputError(where="--data without --out", found=found, needed=needed, fix="Add --out FOLDER")
     require_stride(options.data.data, to="evaluate")
     return options.data if run_config is None else run_config.model_copy(update={"data": options.data.data})

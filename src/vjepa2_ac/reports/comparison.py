@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
@@ -23,8 +24,8 @@ from vjepa2_ac.reports.metrics_json import Metrics, read_metrics
 from vjepa2_ac.runs.checkpoint import RANKING_TOLERANCE, parse_step
 
 _LINE = "  {:<22}  {:>10}  {:>17}  {:>21}  {:>18}"  # widths of the columns, whose headers have three lines
-_WHAT = ("", "", "error vs", "one-step error", "action-ranking")
-_OF_WHAT = "with shuffled actions", "error, chance 50 %"
+_HEAD = ("", "", "error vs", "one-step error", "action-ranking")
+_COLUMNS = "with shuffled actions", "error, chance 50 %"
 _BETTER = ("", "", "(lower is better)", "(higher is better)", "(lower is better)")
 _SAME = ("split", "frames", "stride", "cameras")
 _SAME_LATENTS = 1e-3  # if persistence's errors differ by more than this share, the latents are different
@@ -47,7 +48,7 @@ class Comparison:
         first, key = next(iter(self.measured.values())), f"rollout.{L1.name}.gain_over_base.{len(self.seconds)}"
         has_base = _have_same_base(self.measured.values())
         reference = "base model" if has_base else "persistence"
-        lines = [_LINE.format(*head).rstrip() for head in (_WHAT, ("run", "checkpoint", reference, *_OF_WHAT), _BETTER)]
+        lines = [_LINE.format(*head).rstrip() for head in (_HEAD, ("run", "checkpoint", reference, *_COLUMNS), _BETTER)]
         for name, one in self.measured.items():
             gain, step = one.of(key), _step(one)
             error = self.curves[name][-1].value - 1 if not has_base else -gain.value if gain else 0.0
@@ -95,7 +96,7 @@ class Comparison:
 
     @property
     def _too_few(self) -> str:
-        """A sentence that there are too few episodes for a conclusion; empty if there are enough."""
+        """A sentence that there are too few episodes for a conclusion; empty if there are enough episodes."""
         return next(iter(self.measured.values())).summary.predicts.needs.partition(" So far: ")[0]
 
     def _objection(self, best: str) -> str:
@@ -120,11 +121,12 @@ def compare(folders: Sequence[Path]) -> Comparison:
             on different clips.
     """
     if len(folders) < 2:
-        raise InputError(where="runs to compare", found=f"{len(folders)}", needed="two or more to compare")
-    places = [folder.resolve() for folder in folders]
-    names = [place.name if [one.name for one in places].count(place.name) == 1 else str(place) for place in places]
-    if len(set(places)) < len(places):
-        raise InputError(where=", ".join(map(str, folders)), found="a run that is named twice", needed="each run once")
+        raise InputError(where="compare", found=counted(len(folders), "run"), needed="two or more runs")
+    paths = [folder.resolve() for folder in folders]
+    counts = Counter(path.name for path in paths)
+    names = [path.name if counts[path.name] == 1 else str(path) for path in paths]
+    if len(set(paths)) < len(paths):
+        raise InputError(where=", ".join(map(str, folders)), found="the same run twice", needed="different runs")
     measured = {name: read_metrics(folder) for name, folder in zip(names, folders, strict=True)}
     first = measured[names[0]]
     for name, folder in zip(names[1:], folders[1:], strict=True):
@@ -153,7 +155,7 @@ def _check_same_clips(one: Metrics, other: Metrics, first: Path, second: Path) -
     pairs["clips"] = one.clips.count, other.clips.count
     differences = [f"{what}: {a} and {b}" for what, (a, b) in pairs.items() if a != b]
     if not differences and one.clips.fingerprint != other.clips.fingerprint:
-        differences = [f"other episodes or starts, of {one.about.data} and {other.about.data}"]
+        differences = [f"different episodes or start steps, from {one.about.data} and {other.about.data}"]
     if differences:
         fix = "Evaluate them again with the same --data, --split and --clips"
         found = f"measured on different clips ({'; '.join(differences)})"
@@ -167,14 +169,17 @@ def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
     """
     (name, first), *others = measured.items()
     ids = [episode for episode, _ in first.clips.named]
-    found = []
+    rows = []
     for other, metrics in others:
         columns = np.stack([*_last(metrics), *_last(first)])[:, :, None]
         (gain,) = bootstrap(lambda sums: 1 - (sums[0] / sums[1]) / (sums[2] / sums[3]), columns, ids)
-        group, line = f"Gain over {name}", f"{(first.about.frames - 1) * first.about.seconds_per_step:.2f} s ahead"
+        group, line = (
+            f"Improvement over {name} in L1, open loop",
+            f"{(first.about.frames - 1) * first.about.seconds_per_step:.2f} s ahead",
+        )
         numbers = (gain.value, gain.low, gain.high)
-        found.append(Row(group, line, "gain_over_first", other, *numbers, form=".1%", better="higher", chance=0.0))
-    return found
+        rows.append(Row(group, line, "gain_over_first", other, *numbers, form=".1%", better="higher", chance=0.0))
+    return rows
 
 
 def _last(metrics: Metrics) -> tuple[np.ndarray, np.ndarray]:
@@ -212,22 +217,26 @@ def _have_same_base(measured: Iterable[Metrics]) -> bool:
 
 
 def _notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
-    nothing = {name: _last(one)[1].mean() for name, one in measured.items()}
+    persistence = {name: _last(one)[1].mean() for name, one in measured.items()}
     first, *names = measured
-    others = [name for name in names if abs(nothing[name] / nothing[first] - 1) > _SAME_LATENTS]
+    others = [name for name in names if abs(persistence[name] / persistence[first] - 1) > _SAME_LATENTS]
     notes = []
     if others:
         notes.append(
-            f"Other latents than those of {first} (another encoder or crop): {', '.join(others)}; ratios compare."
+            f"The latents of {', '.join(others)} differ from those of {first} (another encoder or crop):"
+            " only errors relative to persistence can be compared."
         )
-    ways = {name: one.about.checkpoint.partition(" (")[2].rstrip(")") for name, one in measured.items()}
-    if len(set(ways.values())) > 1:
+    selections = {name: one.about.checkpoint.partition(" (")[2].rstrip(")") for name, one in measured.items()}
+    if len(set(selections.values())) > 1:
         notes.append(
-            f"Checkpoints were chosen differently: {', '.join(f'{way} ({name})' for name, way in ways.items())}."
+            f"The checkpoints were selected differently: "
+            f"{', '.join(f'{selection} ({name})' for name, selection in selections.items())}."
         )
     if len({one.ranked for one in measured.values() if one.ranked is not None}) > 1:
         settings = "; ".join(f"{name}: {one.ranked}" for name, one in measured.items())
-        notes.append(f"Action-ranking errors do not compare, the actions were ranked differently ({settings}).")
+        notes.append(
+            f"The action-ranking errors cannot be compared: they were measured with different settings ({settings})."
+        )
     if not _have_same_base(measured.values()) and all(one.base or one.about.is_base for one in measured.values()):
-        notes.append("The runs have different base models: errors are compared with persistence.")
+        notes.append("The runs have different base models. Errors are therefore relative to persistence.")
     return tuple(notes)

@@ -379,16 +379,16 @@ def is_empty(folder: Path) -> bool:
 
 
 def require_new_folder(folder: Path) -> None:
-    """Refuse a folder that exists and is not empty.
+    """Check that a path is free for a new folder: it does not exist, or is an empty folder.
 
     Raises:
-        InputError: The folder is not empty, or cannot be listed.
+        InputError: The path is a file or a folder that is not empty, or cannot be listed.
     """
     with translate_write_errors(folder):
-        in_use = folder.is_dir() and not is_empty(folder)
-    if in_use:
-        found, fix = "the folder exists and is not empty", "Delete it, or choose another folder"
-        raise InputError(where=str(folder), found=found, fix=fix)
+        is_free = not folder.exists() or (folder.is_dir() and is_empty(folder))
+    if not is_free:
+        found = "the folder exists and is not empty" if folder.is_dir() else "a file with this name exists"
+        raise InputError(where=str(folder), found=found, fix="Delete it, or choose another path")
 
 
 def check_local_writable(path: Path) -> None:
