@@ -1,6 +1,6 @@
-"""The public functions: short ways into the other packages. `vjepa2_ac` itself gives their names.
+"""The public functions, which `vjepa2_ac` re-exports.
 
-What trains and evaluates is imported where it is used: to load a model takes no second longer for it.
+Modules for training and evaluation are imported inside of the functions, so that loading a model stays fast.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ logger = logging.getLogger(__name__)
 Device = str | torch.device
 WeightType = Literal["auto", "float32", "bfloat16"]
 
-_REST = {  # of a config
+_MINIMAL_CONFIG = {  # required keys of a config for a data set alone
     "run_dir": "none",
     "data": {"source": "npz", "path": "none"},
     "model": {"base": "builtin:sim-tiny"},
@@ -50,20 +50,21 @@ _REST = {  # of a config
 }
 
 
-def open_dataset(data: str | Path | Config, **knobs: Any) -> Dataset:
-    """Open a data set, and select the episodes and steps that clips come from.
+def open_dataset(data: str | Path | Config, **options: Any) -> Dataset:
+    """Open a data set and select its usable episodes and steps.
 
     Args:
-        data: A folder or URL, of DROID's RLDS form unless `source` says another; or a config, whose `data:` is used.
-        knobs: Knobs of `data:` in a config, such as `frames` and `stride`; `vjepa2-ac config schema` lists them.
+        data: A folder or URL in DROID's RLDS format, or in the format that `source` names; or a config, whose `data:`
+            is used.
+        options: Config keys of `data:`, such as `frames` and `stride`; `vjepa2-ac config schema` lists them.
 
     Returns:
-        The data set. `len(dataset.table)` episodes, `dataset.control_rate_hz` control steps a second;
+        The data set. `len(dataset.table)` episodes, `dataset.control_rate_hz` control steps per second;
         `dataset.clips("train")` is a `torch.utils.data.Dataset` of clips; `dataset.source.read(0)` is an episode with
         its states, steps x 7.
 
     Raises:
-        InputError: There is no such data set, it is damaged, a knob is wrong, or no episode is left.
+        InputError: The data set does not exist or is damaged, an option is invalid, or no usable episode remains.
 
     Example:
         >>> dataset = open_dataset("demo/data", frames=4, stride=4)  # clips of 4 frames, 4 control steps apart
@@ -71,23 +72,25 @@ def open_dataset(data: str | Path | Config, **knobs: Any) -> Dataset:
     """
     if isinstance(data, Config):
         values = config_as_dict(data)
-        config = parse_config(values | {"data": values["data"] | knobs}, where="open_dataset") if knobs else data
+        config = parse_config(values | {"data": values["data"] | options}, where="open_dataset") if options else data
         return datasets.open_dataset(config.data)
     if str(data).endswith((".yaml", ".yml")):
         fix = "Read it first: open_dataset(load_config(PATH))"
         raise InputError(where=str(data), found="a config", needed="the folder of a data set", fix=fix)
-    return datasets.open_dataset(parse_config(_REST | {"data": {"path": str(data)} | knobs}, where="open_dataset").data)
+    return datasets.open_dataset(
+        parse_config(_MINIMAL_CONFIG | {"data": {"path": str(data)} | options}, where="open_dataset").data
+    )
 
 
 def read_clips(dataset: Dataset, split: Split = "train", *, clips: int = 16, batch_size: int = 8) -> Iterator[Batch]:
-    """Yield a fixed set of clips, spread evenly over a split, in batches; the same at each call.
+    """Yield a fixed set of clips, spread evenly over a split, in batches. Each call yields the same clips.
 
     Args:
         dataset: The data set.
         split: train, validation or test: whole episodes, by the data set's own splits, or by a hash of their names
             and `validation_share`, `test_share` (`data.splits`).
-        clips: How many, at most.
-        batch_size: Clips of a batch; the last one may have fewer.
+        clips: Maximum number of clips.
+        batch_size: Number of clips per batch; the last batch may have fewer.
 
     Yields:
         Batches of `frames` (clips x time x height x width x 3, uint8, RGB, cropped; None of a latent cache), `states`
@@ -106,44 +109,44 @@ def read_clips(dataset: Dataset, split: Split = "train", *, clips: int = 16, bat
 
 
 @overload
-def encode(model: WorldModel, seen: Batch, *, chunk: int = 16) -> LatentBatch: ...
+def encode(model: WorldModel, clips: Batch, *, chunk: int = 16) -> LatentBatch: ...
 
 
 @overload
 def encode(
-    model: WorldModel, seen: UInt8[np.ndarray, "*axes height width 3"], *, crop: Crop = "released", chunk: int = 16
+    model: WorldModel, clips: UInt8[np.ndarray, "*axes height width 3"], *, crop: Crop = "released", chunk: int = 16
 ) -> Float[Tensor, "*axes tokens dim"]: ...
 
 
 def encode(
-    model: WorldModel, seen: Batch | np.ndarray, *, crop: Crop = "released", chunk: int = 16
+    model: WorldModel, clips: Batch | np.ndarray, *, crop: Crop = "released", chunk: int = 16
 ) -> LatentBatch | Tensor:
     """Return the latents of clips or frames, on the model's device; each frame is encoded independently.
 
     Args:
         model: The model whose encoder is used.
-        seen: A batch of `read_clips`; or RGB frames with any axes before height x width x 3, uint8.
-        crop: Part of a frame that the model sees, as `data.crop`; a batch is already cropped.
-        chunk: Frames that go through the encoder at once: bounds the memory.
+        clips: A batch from `read_clips`; or RGB frames, uint8, with any axes before height x width x 3.
+        crop: Crop of the frames, as `data.crop`; a batch is already cropped.
+        chunk: Number of frames that are encoded at once; limits the memory.
 
     Returns:
-        Of frames: latents, the axes before height x tokens x dim, float32, layer-normalised. Of a batch: a record of
-        its `latents` (clips x time x tokens x dim), `states` and `actions`, all on the device.
+        For frames: latents with the same leading axes x tokens x dim, float32, layer-normalised. For a batch: a record
+        with its `latents` (clips x time x tokens x dim), `states` and `actions`, all on the device.
 
     Raises:
-        InputError: These are no such frames, or the model needs camera poses that the batch does not have.
+        InputError: The frames are invalid, or the model needs camera poses that the batch does not have.
 
     Example:
-        >>> seen = encode(model, batch)
-        >>> future = model.rollout(seen.latents[:, :1], seen.actions, seen.states[:, :-1])  # clips x time-1 x ...
-        >>> encode(model, image).shape  # of one image: tokens x dim
+        >>> encoded = encode(model, batch)
+        >>> future = model.rollout(encoded.latents[:, :1], encoded.actions, encoded.states[:, :-1])  # clips x time-1 x ...
+        >>> encode(model, image).shape  # one image: tokens x dim
         torch.Size([36, 128])
     """
-    if isinstance(seen, Batch):
-        return encode_batch(model, seen, device=model.device, chunk=chunk)
-    frames = np.asarray(seen)
+    if isinstance(clips, Batch):
+        return encode_batch(model, clips, device=model.device, chunk=chunk)
+    frames = np.asarray(clips)
     if frames.dtype != np.uint8 or frames.ndim < 3 or frames.shape[-1] != 3 or 0 in frames.shape:
-        found = f"{frames.dtype} of the shape {' x '.join(map(str, frames.shape))}"
+        found = f"{frames.dtype} with shape {' x '.join(map(str, frames.shape))}"
         raise InputError(where="encode", found=found, needed="RGB frames: uint8, ... x height x width x 3")
     latents = encode_frames(model, frames.reshape(-1, *frames.shape[-3:]), crop, chunk=chunk)
     return latents.reshape(*frames.shape[:-3], *latents.shape[-2:])
@@ -161,16 +164,16 @@ def load_model(
     """Load a world model, in eval mode; no weight requires a gradient.
 
     Args:
-        name: What `model.base` takes: the official `.pt`, a folder from `vjepa2-ac export`, or `builtin:sim-tiny`.
-        adapter: A folder from `vjepa2-ac export --to hub`, whose adapter is put on this model.
-        device: Such as cpu or cuda:1; auto: CUDA where there is one.
-        dtype: Type of the weights; auto: bfloat16 on a GPU that computes in it, else float32. Trained weights of an
+        name: A model as in `model.base`: the official `.pt`, a folder from `vjepa2-ac export`, or `builtin:sim-tiny`.
+        adapter: A folder from `vjepa2-ac export --to hub`, whose adapter is added to this model.
+        device: A device such as cpu or cuda:1; auto: CUDA if available.
+        dtype: Type of the weights; auto: bfloat16 on a GPU that supports it, otherwise float32. Trained weights of an
             adapter are float32, and so are latents.
-        sizes: Of an official `.pt`, whose file has no image size and heads; None: the released ones.
-        encoder: Of a file that holds a predictor alone: what `model.encoder` or its path takes; None: the model's own.
+        sizes: Sizes of an official `.pt`, which does not contain image size and heads; None: the released sizes.
+        encoder: Encoder for a file that contains only a predictor: `model.encoder` or its path; None: the model's own.
 
     Raises:
-        InputError: There is no such model, adapter or device, it cannot be read, or the adapter is of another base.
+        InputError: Model, adapter or device do not exist or cannot be used, or the adapter has another base model.
 
     Example:
         >>> model = load_model("builtin:sim-tiny")
@@ -199,31 +202,31 @@ def load_run(
     device: Device = "auto",
     overrides: Iterable[str] = (),
 ) -> Subject:
-    """Load the model of a trained run, in eval mode: its base with the adapter of a complete checkpoint.
+    """Load the model of a trained run, in eval mode: the base model with the adapter of a checkpoint.
 
     Args:
-        folder: The run, as `train` returns it.
+        folder: The folder of the run, as `train` returns it.
         checkpoint: selected (the best by validation, else the newest), newest, best, or a number of optimizer steps.
-        device: As of `load_model`. The type of the base's weights is the run's `model.dtype`.
-        overrides: Where the base or the encoder was moved: model.base=PATH, model.encoder.path=PATH. The fingerprints
-            of the weights must be those that the run was trained on.
+        device: As for `load_model`. The weights of the base model have the type `model.dtype` of the run.
+        overrides: New paths of a moved base model or encoder: model.base=PATH, model.encoder.path=PATH. The
+            fingerprints of the weights must be those that the run was trained with.
 
     Returns:
-        `world_model`, with the adapter beside its base; `config` of the run; `checkpoint`, the folder it is from.
+        A record with `world_model` (the adapter is not merged), `config` of the run, and `checkpoint`, its folder.
 
     Raises:
-        InputError: Not a run, no such checkpoint or device, or its base cannot be loaded.
+        InputError: The folder is not a run, checkpoint or device do not exist, or the base model cannot be loaded.
 
     Example:
         >>> run = load_run("runs/droid-lora", "best")
         >>> controller = Controller.of_run(run)
     """
-    place, folder = _device(device), Path(folder)
+    torch_device, folder = _device(device), Path(folder)
     if not is_run(str(folder)) and (folder / ADAPTER_FILE).is_file():
-        found, fix = "an adapter without its run", "Name its base, too: load_model(BASE, adapter=FOLDER)"
+        found, fix = "an adapter without its run", "Load it with its base model: load_model(BASE, adapter=FOLDER)"
         raise InputError(where=str(folder), found=found, needed="the folder of a run", fix=fix)
     run = load_subject(folder, str(checkpoint), config=read_config_of_moved_run(folder, overrides))
-    run.world_model.to(place)
+    run.world_model.to(torch_device)
     return run
 
 
@@ -235,21 +238,22 @@ def train(
     check_only: bool = False,
     allow_config_change: bool = False,
 ) -> Path:
-    """Train as a config says, as `vjepa2-ac train` does, and return the folder of the run.
+    """Train a model as `vjepa2-ac train` does, and return the folder of the run.
 
-    If the folder `run_dir` has this run already, training resumes from its newest checkpoint; a finished run is left
-    as it is. In the main thread SIGINT (Ctrl-C), SIGTERM and SIGUSR1 end it after the current step, with a checkpoint.
+    If the folder `run_dir` contains this run, training resumes from the newest checkpoint; a finished run is not
+    changed. In the main thread SIGINT (Ctrl-C), SIGTERM and SIGUSR1 stop training after the current step, and a
+    checkpoint is saved.
 
     Args:
-        config: The run, from `load_config`.
-        note: Called with each message, such as the result of a validation; `print` shows them.
+        config: The config, from `load_config`.
+        note: Called with each message, such as the result of a validation; for example `print`.
         on_step: Called after each optimizer step with its number, from 1, and its metrics: `loss`, `grad_norm` ...
-        check_only: Do everything that can fail, and stop before the first step; nothing is written.
-        allow_config_change: Resume a run whose folder has another config.
+        check_only: Check data, model, folder and disk, and stop before the first step. Nothing is written.
+        allow_config_change: Resume the run even if its config differs.
 
     Raises:
-        InputError: Something cannot be used; raised before the first step wherever possible.
-        StoppedError: A signal ended it, see `process`; the same call resumes.
+        InputError: An input cannot be used; raised before the first step if possible.
+        StoppedError: A signal stopped the training (see `process`); the same call resumes it.
 
     Example:
         >>> run = train(load_config("configs/demo.yaml", ["training.steps=200"]), note=print)
@@ -275,17 +279,17 @@ def evaluate(
     For more options, such as other models to compare with, see `vjepa2_ac.evaluation.evaluate_run.evaluate_subject`.
 
     Args:
-        subject: The folder of a run, which is measured beside its base; or a model, as of `load_model`.
-        data: A config with other data than the run's own; a model has none of its own.
-        out: Folder for metrics.json, report.html and evaluation.png; None: the run's. Needed with `data`.
-        clips: At most as many, spread over the test episodes.
-        checkpoint: Of a run: selected (the best, else the newest), newest, best, or a number of steps.
-        probes: Whether the use of the actions is measured in detail, which takes most of the time: other actions,
-            energy landscapes, examples.
+        subject: The folder of a run, which is compared with its base model; or a model, as for `load_model`.
+        data: A config with the data; None: the data of the run. Required for a model.
+        out: Folder for metrics.json, report.html and evaluation.png; None: the run's folder. Required with `data`.
+        clips: Maximum number of clips, spread over the test episodes.
+        checkpoint: For a run: selected (the best, otherwise the newest), newest, best, or a number of steps.
+        probes: Whether to measure action ranking and energy landscapes and to save example clips, which takes most of
+            the time.
 
     Returns:
-        `summary`, the verdicts, as lines by `str`; `error_over_persistence` of each model by horizon (below 1: better
-        than copying the first frame); `files` that were written; `evaluation`, all arrays.
+        `summary`, the verdicts (`str` formats them); `error_over_persistence` of each model by horizon (below 1: better
+        than persistence); `files` that were written; `evaluation`, all arrays.
 
     Raises:
         InputError: The subject or the data cannot be used, there are no test episodes, or the folder cannot be written.
@@ -300,16 +304,16 @@ def evaluate(
     from vjepa2_ac.reports.write import write_evaluation
 
     if data is not None and out is None:
-        needed = "a folder for the results: those in a run's own folder are of its own data"
-        raise InputError(where="evaluate", found="data without out", needed=needed, fix="Name one: out=FOLDER")
-    asked = EvaluationOptions(
+        needed = "a folder for the results: those in a run's folder belong to the run's own data"
+        raise InputError(where="evaluate", found="data without out", needed=needed, fix="Pass out=FOLDER")
+    options = EvaluationOptions(
         clips=clips,
         checkpoint=str(checkpoint),
         data=data,
         out=None if out is None else Path(out),
         probes=ProbeOptions() if probes else ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0),
     )
-    return write_evaluation(evaluate_subject(str(subject), asked), asked.out or Path(subject))
+    return write_evaluation(evaluate_subject(str(subject), options), options.out or Path(subject))
 
 
 class _CallbackReporter(Reporter):
@@ -338,12 +342,14 @@ def _device(device: Device) -> torch.device:
     if device == "auto":
         return torch.device("cuda" if has_cuda else "cpu")
     try:
-        found = torch.device(device)
+        result = torch.device(device)
     except (RuntimeError, TypeError):
-        raise InputError(where="device", found=repr(device), needed="auto, cpu, cuda, or one such as cuda:1") from None
-    if found.type == "cuda" and not has_cuda:
-        raise no_cuda_error(where="device", requested=str(device), instead="Take device='cpu'")
-    if found.type == "cuda" and (found.index or 0) >= (count := torch.cuda.device_count()):
+        raise InputError(
+            where="device", found=repr(device), needed="auto, cpu, cuda, or a device such as cuda:1"
+        ) from None
+    if result.type == "cuda" and not has_cuda:
+        raise no_cuda_error(where="device", requested=str(device), instead="Use device='cpu'")
+    if result.type == "cuda" and (result.index or 0) >= (count := torch.cuda.device_count()):
         needed = f"one of the {count} CUDA devices of this machine, cuda:0 to cuda:{count - 1}"
         raise InputError(where="device", found=str(device), needed=needed)
-    return found
+    return result

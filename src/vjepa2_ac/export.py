@@ -1,4 +1,4 @@
-"""Export of a trained run: as one merged model, as Meta's checkpoint, or as an adapter with its card for the Hub."""
+"""Export a trained run as a merged model, as a checkpoint in Meta's format, or as an adapter with a model card."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from vjepa2_ac.storage.tensors import require_finite
 
 Form = Literal["merged", "official", "hub"]
 
-OFFICIAL_NAME = "vjepa2-ac.pt"  # in a folder; a destination that ends in .pt is the file itself
+OFFICIAL_NAME = "vjepa2-ac.pt"  # name of the file if the destination is a folder
 CARD = "README.md"
 
 
@@ -47,7 +47,7 @@ class Exported:
     """The result of an export."""
 
     path: Path  # the file or folder
-    checkpoint: str  # the one it was made from, as text
+    checkpoint: str  # description of the exported checkpoint
 
 
 def export_run(
@@ -59,20 +59,20 @@ def export_run(
 ) -> Exported:
     """Export a trained run, atomically.
 
-    An adapter is merged in float32, then cast to the type of the base's weights (`model.dtype`).
+    An adapter is merged in float32 and then cast to the type of the base model (`model.dtype`).
 
     Args:
         folder: The run.
         destination: A new or empty folder; for official also a file ending in `.pt`, which must not exist.
-        form: merged: the model as a folder, which `model.base` takes. official: one `.pt` with Meta's names, q, k
-            and v fused, for the official code. hub: the adapter in PEFT's format with a model card, ready to upload.
+        form: merged: the model as a folder for `model.base`. official: one `.pt` with Meta's parameter names and fused
+            q, k and v, for the official code. hub: the adapter in PEFT's format with a model card, ready to upload.
         checkpoint: selected (the best, else the newest), newest, best, or a number of optimizer steps.
-        overrides: Where the base or the encoder was moved, as `api.load_run` takes them.
+        overrides: New paths of a moved base model or encoder, as for `api.load_run`.
 
     Raises:
-        InputError: As `load_run`; the destination is occupied or cannot be written; official: Meta's code has no such
-            model; hub: the run has no adapter, or its `metrics.json` is damaged; or a weight of the merged model is not
-            finite, whatever the form.
+        InputError: As for `load_run`; the destination is not free or cannot be written; official: Meta's code does not
+            support the model; hub: the run has no adapter, or its `metrics.json` is damaged; a weight of the merged
+            model is not finite.
     """
     _check_free(destination, form)
     config = read_config_of_moved_run(folder, overrides)
@@ -83,9 +83,9 @@ def export_run(
         raise InputError(where=str(folder), found=found, needed=needed, fix=fix)
     metrics = read_metrics(folder) if form == "hub" and (folder / METRICS_FILE).exists() else None
     run = load_subject(folder, checkpoint, config=config)
-    assert run.checkpoint is not None  # noqa: S101  # a run has one
+    assert run.checkpoint is not None  # noqa: S101  # a run always has a checkpoint
     card = _card(run, run.checkpoint, folder, metrics) if form == "hub" else ""
-    merge_adapter(run.world_model)  # also for the Hub: an adapter that makes it not finite is of no use
+    merge_adapter(run.world_model)  # also for the Hub, to check that the merged weights are finite
     require_finite(
         run.world_model.predictor.state_dict(),
         where=f"{run.checkpoint}, merged into its base",
@@ -120,7 +120,7 @@ def _write_hub(checkpoint: Path, folder: Path, destination: Path, card: str, met
         if metrics is not None:
             if (folder / PLOT).is_file():
                 shutil.copyfile(folder / PLOT, fresh / PLOT)
-            written = json.loads((folder / METRICS_FILE).read_bytes())  # without paths of this machine
+            written = json.loads((folder / METRICS_FILE).read_bytes())  # paths of this machine are removed
             written["about"] |= {"subject": folder.resolve().name, "checkpoint_path": _measured(metrics)}
             written["summary"] |= {"subject": folder.resolve().name}
             write_atomically(fresh / METRICS_FILE, json.dumps(written, indent=1))
@@ -141,7 +141,7 @@ def _card(run: Subject, checkpoint: Path, folder: Path, metrics: Metrics | None)
     environment.filters |= {"code": code, "count": counted, "ratio": _ratio}
     measured = None if metrics is None else _measured(metrics)
     summary = None
-    if metrics is not None:  # a closed loop may be newer than this file
+    if metrics is not None:  # a closed-loop benchmark may be newer than metrics.json
         summary = with_closed_loop(replace(metrics.summary, subject=name), folder, metrics.about.checkpoint)
     front = ModelCardData(
         library_name="peft",
@@ -175,14 +175,14 @@ def _measured(metrics: Metrics) -> str:
 
 
 def _base_arguments(config: Config) -> str:
-    """Return the arguments with which `load_model` gives the base, as Python source."""
+    """Return the arguments of `load_model` for the base model, as Python source."""
     words = [repr(config.model.base), f"dtype={config.model.dtype!r}"]
     for name, part in (("sizes", config.model.sizes), ("encoder", config.model.encoder)):
-        told = {} if part is None else part.model_dump(mode="json", exclude_defaults=True)
-        if told.keys() == {"path"}:
-            words.append(f"{name}={told['path']!r}")
-        elif told:
-            words.append(f"{name}={type(part).__name__}.model_validate({told!r})")
+        values = {} if part is None else part.model_dump(mode="json", exclude_defaults=True)
+        if values.keys() == {"path"}:
+            words.append(f"{name}={values['path']!r}")
+        elif values:
+            words.append(f"{name}={type(part).__name__}.model_validate({values!r})")
     return ", ".join(words)
 
 
