@@ -137,8 +137,8 @@ def encode(
         InputError: The frames are invalid, or the model needs camera poses that the batch does not have.
 
     Example:
-        >>> encoded = encode(model, batch)
-        >>> future = model.rollout(encoded.latents[:, :1], encoded.actions, encoded.states[:, :-1])  # clips x time-1 x ...
+        >>> inputs = encode(model, batch)
+        >>> future = model.rollout(inputs.latents[:, :1], inputs.actions, inputs.states[:, :-1])  # clips x time-1 x ...
         >>> encode(model, image).shape  # one image: tokens x dim
         torch.Size([36, 128])
     """
