@@ -23,7 +23,7 @@ from vjepa2_ac.data.transforms import to_display_frames
 from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, TrainedDecoder, load_decoder, to_pixels
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.media.figure import RolloutStrip, StripRow, draw_strip, render_frames, schedule_loop
+from vjepa2_ac.media.figure import FrameKind, RolloutStrip, StripRow, draw_strip, render_frames, schedule_loop
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import write_gif, write_video
 from vjepa2_ac.model.lora import use_base_weights
@@ -165,11 +165,9 @@ def make_strip(comparison: RolloutComparison) -> RolloutStrip:
                 frames = np.concatenate([decoded_first, comparison.decoded_truth])
                 rows.append(StripRow("ground truth,\ndecoded", "decoded", frames, sequence=sequence))
             frames = np.concatenate([decoded_first, rollout.frames])
-            rows.append(
-                StripRow(
-                    f"prediction of\n{rollout.model}", "predicted", frames, sequence=sequence, outlines=rollout.outlines
-                )
-            )
+            kind: FrameKind = "predicted_base" if rollout.model == "base" else "predicted"
+            label = f"prediction of\n{rollout.model}"
+            rows.append(StripRow(label, kind, frames, sequence=sequence, outlines=rollout.outlines))
     clip = (
         f"{_shorten_name(comparison.episode_id)} from control step {comparison.start}"
         if comparison.episode_id

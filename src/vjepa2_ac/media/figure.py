@@ -33,6 +33,7 @@ from vjepa2_ac.storage import atomic_writer
 # noncharacters, and marks that change the direction of text.
 _HIDDEN = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff\\ufffe\\uffff]")
 GREY, BLUE, ORANGE, GREEN, RED = "#8a8a8a", "#1f6fb4", "#d1762a", "#2b8a3e", "#b3246b"
+_PURPLE = "#6b4fa0"
 _STYLE = {
     "axes.spines.right": False,
     "axes.spines.top": False,
@@ -108,17 +109,19 @@ def replace_hidden_characters(text: str) -> str:
 # ---- image strips and videos of rollouts ----
 
 Pixels = UInt8[np.ndarray, "_ _ 3"]
-FrameKind = Literal["recorded", "simulated", "decoded", "predicted", "error"]
+FrameKind = Literal["recorded", "simulated", "decoded", "predicted_base", "predicted", "error"]
 
 FRAME_KINDS: dict[FrameKind, tuple[str, str]] = {
     "recorded": (GREY, "ground truth, recorded"),
     "simulated": (GREEN, "ground truth, simulated"),
-    "decoded": (BLUE, "decoded from the true frame's latents"),
-    "predicted": (ORANGE, "predicted from the input frame and the actions"),
+    "decoded": (_PURPLE, "decoded from the true frame's latents"),
+    "predicted_base": (ORANGE, "predicted by the base model"),
+    "predicted": (BLUE, "predicted by the evaluated model"),
     "error": (RED, "error of each patch (brighter: larger error)"),
 }
-"""The colour and the legend text of each kind of frame."""
+"""The colour and the legend text of each kind of frame. Plots show the models in the same colours."""
 
+_PREDICTED = {"predicted_base", "predicted"}
 _DPI = 100  # pixels per inch
 _LABEL, _SEQUENCE, _HEAD, _GAP, _LINE, _LEGEND = 160, 90, 90, 14, 17, 270  # pixels
 _MAX_COLUMNS = 6  # more are too small to read on a page that is 800 pixels wide
@@ -163,7 +166,7 @@ def draw_strip(strip: RolloutStrip, *, side: int = 116) -> Pixels:
     columns = min(len(strip.seconds), _MAX_COLUMNS)
     captioned = sum(bool(row.captions) for row in strip.rows)
     size = _LABEL + columns * (side + _GAP), _HEAD + len(strip.rows) * (side + _GAP) + _LINE * captioned
-    kinds = {row.kind for row in strip.rows} | {"decoded" for row in strip.rows if row.kind == "predicted"}
+    kinds = {row.kind for row in strip.rows} | {"decoded" for row in strip.rows if row.kind in _PREDICTED}
     patches = [Patch(color=colour, label=text) for kind, (colour, text) in FRAME_KINDS.items() if kind in kinds]
     with _figure(strip, size) as figure:
         legend = {"ncols": max(1, size[0] // _LEGEND), "fontsize": 8, "handlelength": 1, "alignment": "left"}
@@ -250,7 +253,7 @@ def show_with_border(axes: Any, image: UInt8[np.ndarray, "height width 3"], kind
 
 
 def _show(axes: Any, row: StripRow, index: int) -> None:
-    show_with_border(axes, row.frames[index], "decoded" if row.kind == "predicted" and index == 0 else row.kind)
+    show_with_border(axes, row.frames[index], "decoded" if row.kind in _PREDICTED and index == 0 else row.kind)
     if row.outlines is not None and row.outlines[index].any():
         for colour, width in (("black", 2.2), ("white", 1.2)):
             axes.contour(row.outlines[index], [0.5], colors=colour, linewidths=width)

@@ -186,10 +186,11 @@ def decoded_strip(evaluation: Evaluation, strip: DecodedStrip) -> RolloutStrip:
         "truth": ("ground truth", "recorded"),
         "decoded_truth": ("ground truth,\ndecoded", "decoded"),
     }
-    rows = [
-        StripRow(*labels.get(name, (f"prediction of\n{_short(name)}", "predicted")), np.ascontiguousarray(frames))
-        for name, frames in strip.rows.items()
-    ]
+    rows = []
+    for name, frames in strip.rows.items():
+        kind: FrameKind = "predicted_base" if name == evaluation.base else "predicted"
+        label, kind = labels.get(name, (f"prediction of\n{_short(name)}", kind))
+        rows.append(StripRow(label, kind, np.ascontiguousarray(frames)))
     times = range(len(rows[0].frames))
     title = f"{replace_hidden_characters(strip.why)[:80]}: control step {strip.start}"
     return RolloutStrip(title, tuple(rows), tuple(time * evaluation.about.seconds_per_step for time in times))
