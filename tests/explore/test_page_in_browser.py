@@ -76,6 +76,7 @@ def test_action_changes_all_images_and_undo_restores_them(live: Views, open_page
         after = [get_pixels(page, of) for of in ("base", "adapter", "truth")]
         assert all(one != other for one, other in zip(before, after, strict=True))
         assert re.search(r"error \d\.\d+.*persistence \d\.\d+", role(page, "sentence").inner_text())
+        assert re.search(r"turn left \d\.\d°: ", role(page, "sentence").inner_text())
         role(page, "undo").click()
         wait_for_steps(page, 0)
         assert [get_pixels(page, of) for of in ("base", "adapter", "truth")] == before
@@ -108,6 +109,7 @@ def test_all_functions_are_available_by_keys(live: Views, open_page: Any) -> Non
         page.keyboard.press("p")
         role(page, "best").locator("figure").first.wait_for()
         wait_for_steps(page, 5)
+        assert not re.findall("undefined|NaN|\\[object", page.locator("body").inner_text())
 
 
 def test_keys_command_no_motion_while_a_number_is_typed(live: Views, open_page: Any) -> None:

@@ -6,7 +6,7 @@
 /** @typedef {Map<string, HTMLImageElement>} Images decoded images by name */
 /** @typedef {{header: Header, images: Images}} Answer */
 /** @typedef {{kind: string, fields: object, seq: number, settle: (answer: Answer | Error | null) => void}} Request */
-/** @typedef {{shown_unit: string, factor: number}} Unit displayed unit of a number */
+/** @typedef {{display_unit: string, factor: number}} Unit displayed unit of a number */
 
 const SEARCHES = new Set(["energy", "plan"]); // requests that are cancelled by a newer request
 const FIRST_RETRY_MS = 500;
@@ -204,7 +204,7 @@ export function formatValue(value, unit, signed = false) {
   if (value === null) return "–";
   const text = Math.abs(value * unit.factor).toFixed(getDigits(unit));
   const sign = value < 0 && Number(text) !== 0 ? "−" : signed ? "+" : "";
-  return `${sign}${text}${unit.shown_unit && unit.shown_unit !== "°" ? " " : ""}${unit.shown_unit}`;
+  return `${sign}${text}${unit.display_unit && unit.display_unit !== "°" ? " " : ""}${unit.display_unit}`;
 }
 
 /** @param {Unit} unit */
