@@ -9,12 +9,15 @@ from types import SimpleNamespace
 import pytest
 
 import vjepa2_ac
+from vjepa2_ac.cli.closed_loop import _summary
 from vjepa2_ac.cli.evaluate import _next
 from vjepa2_ac.cli.options import QUICK_WORDS, option_words, parsed, quick_words
 from vjepa2_ac.cli.program import _parser
 from vjepa2_ac.config.loading import config_as_yaml, load_config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.errors import shell_command
+from vjepa2_ac.evaluation.summary import Summary, not_measured_verdict
+from vjepa2_ac.reports.metrics_json import METRICS_FILE
 from vjepa2_ac.simulation import record
 from vjepa2_ac.simulation.record import RecordedSimulation, RecordingSpec
 
@@ -70,6 +73,24 @@ def next_of_evaluate(
     verdicts = (first, SimpleNamespace(conclusion="yes"), planning or SimpleNamespace(conclusion=ranks))
     summary = SimpleNamespace(predicts=first, plans=planning, verdicts=verdicts)
     return _next(SimpleNamespace(evaluation=SimpleNamespace(about=about), summary=summary), options)
+
+
+@pytest.mark.parametrize(("step", "is_same"), [(10, True), (20, False)])
+def test_closed_loop_summary_includes_an_evaluation_of_the_same_checkpoint_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int, *, is_same: bool
+) -> None:
+    verdict = not_measured_verdict("planning", "`vjepa2-ac simulate`")
+    summary = Summary("run", "on 9 clips", verdict, verdict, verdict, None)
+    about = SimpleNamespace(checkpoint=f"step-{step:08d} (as asked for)")  # older versions wrote these words
+    monkeypatch.setattr(
+        "vjepa2_ac.reports.metrics_json.read_metrics", lambda _: SimpleNamespace(about=about, summary=summary)
+    )
+    (tmp_path / METRICS_FILE).touch()
+    subject = SimpleNamespace(name=str(tmp_path), chosen="step-00000010 (as requested)")
+    trials = SimpleNamespace(task="reach", place="domain A", steps=20, seconds_per_step=0.25)
+    options = parse(["simulate", str(tmp_path), "--task", "reach", "--domain", "A"])
+    found = _summary(SimpleNamespace(subject=subject, trials=trials), verdict, options)
+    assert (found.predicts.name == "planning") == is_same
 
 
 def test_real_data_are_never_sent_to_the_simulated_arm(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,6 +30,7 @@ from vjepa2_ac.runs.checkpoint import (
     read_state,
     read_torch,
     select_checkpoint,
+    selection_reason,
     write_checkpoint,
     write_manifest,
     write_torch,
@@ -373,6 +374,19 @@ def test_the_newest_the_best_and_that_of_a_step_are_found(run: Path, by: str, wo
     chosen = select_checkpoint(run, by)
     assert str(chosen) == words
     assert chosen.path == run / "checkpoints" / words.split(maxsplit=1)[0]
+
+
+@pytest.mark.parametrize(
+    ("written", "reason"),
+    [
+        ("step-00000010 (as asked for)", "as requested"),
+        ("step-00000030 (the newest: none was selected)", "the newest, none was selected by validation"),
+        ("step-00000020 (the best by error)", "the best by error"),
+        ("", ""),
+    ],
+)
+def test_reasons_of_older_files_equal_those_written_now(written: str, reason: str) -> None:
+    assert selection_reason(written) == reason
 
 
 @pytest.mark.parametrize(("by", "found"), [("15", "no checkpoint of step 15"), ("bset", "--checkpoint bset")])

@@ -11,7 +11,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config, EncoderSizes, ModelSizes
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.model.lora import trainable_report
-from vjepa2_ac.training.cost import count_parameters, estimate_memory, suggest_memory_savings
+from vjepa2_ac.training.cost import MemoryEstimate, count_parameters, estimate_memory, suggest_memory_savings
 from vjepa2_ac.training.optim import make_optimizer
 
 
@@ -72,6 +72,14 @@ def test_doctor_says_whether_it_fits_and_what_of_it_is_estimated(tmp_path, capsy
     assert "allowance was not measured" in " ".join(reported.split())
     assert " 0.000 GB" not in reported
     assert f"vjepa2-ac train {path} --check" in reported
+
+
+@pytest.mark.parametrize(("encoder", "peak"), [(90, 100), (97, 102)])
+def test_batch_is_not_counted_while_the_predictor_runs(encoder: int, peak: int) -> None:
+    parts = dict.fromkeys(estimate_memory(usual(), model_sizes()).parts, 0)
+    parts |= {"batch": 5, "encoder activations": encoder, "predictor activations": 100}
+    parameters = count_parameters(usual(), model_sizes())
+    assert MemoryEstimate(parameters, checkpointing=False, parts=parts).total(checkpointing=False) == peak
 
 
 # Parameter counts are exact: tensor by tensor those of a built model

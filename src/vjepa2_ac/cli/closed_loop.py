@@ -272,7 +272,9 @@ def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse
     if subject.chosen and (Path(subject.name) / METRICS_FILE).is_file():
         with contextlib.suppress(InputError):  # metrics.json has an older format: keep "not measured"
             evaluated = read_metrics(Path(subject.name))
-            if evaluated.about.checkpoint == subject.chosen:
+            # Only the names are compared, because older files describe the selection in other words.
+            names = {text.partition(" ")[0] for text in (evaluated.about.checkpoint, subject.chosen)}
+            if len(names) == 1:
                 summary = replace(evaluated.summary, measured=measured, plans=verdict)
     return summary
 

@@ -21,7 +21,7 @@ from vjepa2_ac.evaluation.rows import Row
 from vjepa2_ac.evaluation.summary import Verdict, format_percent
 from vjepa2_ac.intervals import Estimate, bootstrap
 from vjepa2_ac.reports.metrics_json import Metrics, read_metrics
-from vjepa2_ac.runs.checkpoint import RANKING_TOLERANCE, parse_step
+from vjepa2_ac.runs.checkpoint import RANKING_TOLERANCE, parse_step, selection_reason
 
 _LINE = "  {:<22}  {:>10}  {:>17}  {:>21}  {:>18}"  # widths of the columns, whose headers have three lines
 _HEAD = ("", "", "error vs", "one-step error", "action-ranking")
@@ -226,7 +226,7 @@ def _notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
             f"The latents of {', '.join(others)} differ from those of {first} (another encoder or crop):"
             " only errors relative to persistence can be compared."
         )
-    selections = {name: one.about.checkpoint.partition(" (")[2].rstrip(")") for name, one in measured.items()}
+    selections = {name: selection_reason(one.about.checkpoint) for name, one in measured.items()}
     if len(set(selections.values())) > 1:
         notes.append(
             f"The checkpoints were selected differently: "

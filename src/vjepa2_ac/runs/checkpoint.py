@@ -363,6 +363,17 @@ def _require_as_written(path: Path) -> None:
 
 # ---- selection ----
 
+_FORMER_REASONS = {  # text in files written before 2026-12-01 -> the text for the same selection now
+    "the newest: none was selected": "the newest, none was selected by validation",
+    "as asked for": "as requested",
+}
+
+
+def selection_reason(description: str) -> str:
+    """Return how a checkpoint was selected, from its description in a file: str(SelectedCheckpoint), of any version."""
+    reason = description.partition(" (")[2].removesuffix(")")
+    return _FORMER_REASONS.get(reason, reason)
+
 
 @dataclass(frozen=True)
 class SelectedCheckpoint:

@@ -51,7 +51,7 @@ _BYTES_OF_CACHED = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
 _SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # elements, as in bitsandbytes
 _CHECKPOINTED = ", checkpointed"
 _STANDING = (  # parts that are allocated all the time
-    "encoder weights", "predictor weights", "trained weights", "optimizer state", "batch", "CUDA allowance",
+    "encoder weights", "predictor weights", "trained weights", "optimizer state", "CUDA allowance",
 )  # fmt: skip
 _OF_LOSS = {"loss", "rollout_steps"}
 _WITH_EFFECT: Any = {
@@ -301,7 +301,8 @@ class MemoryEstimate:
         parts = self.parts
         predicting = parts["adapter copies"] + parts[f"predictor activations{_CHECKPOINTED * checkpointing}"]
         old_weights = parts["trained weights"]  # `update_to_weight` needs them on logged steps
-        computing = parts["latents"] + max(parts["encoder activations"], predicting)
+        encoding = parts["encoder activations"] + parts["batch"]  # the batch is freed when its latents are computed
+        computing = parts["latents"] + max(encoding, predicting)
         training = parts["gradients"] + max(computing, old_weights)
         standing = sum(parts[name] for name in _STANDING)
         return max(standing + max(training, parts["validation"]), parts["encoding the cache"])
@@ -343,7 +344,7 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
         "trained weights": trained,
         "gradients": trained,
         "optimizer state": sum(_moments(config, elements) for elements in parameters.trained_tensors),
-        "batch": batch_bytes(config, sizes),
+        "batch": batch_bytes(config, sizes, config.training.batch_size),
         "latents": _latents(config, sizes, config.training.batch_size),
         "encoder activations": _encoding(config, sizes, config.training.batch_size),  # before the predictor runs
         "validation": _validating(config, sizes, step),
@@ -403,9 +404,9 @@ def _moments(config: Config, elements: int) -> int:
     return 2 * (elements + -(-elements // _ELEMENTS_OF_A_SCALE) * FLOAT32)
 
 
-def batch_bytes(config: Config, sizes: ModelSizes) -> int:
+def batch_bytes(config: Config, sizes: ModelSizes, clips: int) -> int:
     """Return the bytes of a batch from the loader: latents, or frames, assumed to have the model's image size."""
-    frames = config.training.batch_size * config.data.frames
+    frames = clips * config.data.frames
     if not config.data.uses_cached_latents:
         return frames * 3 * sizes.image_size**2
     return frames * sizes.tokens_per_frame * sizes.encoder.width * _BYTES_OF_CACHED[config.data.cache_dtype]
@@ -447,4 +448,5 @@ def _validating(config: Config, sizes: ModelSizes, step: StepBytes) -> int:
     latents, number = _latents(config, sizes, clips), FLOAT32 if config.training.precision == "fp32" else HALF
     tokens = sizes.tokens_per_frame + 1 + predictor.use_states + predictor.use_extrinsics
     cached = 2 * predictor.depth * clips * (config.data.frames - 2) * tokens * predictor.width * number
-    return latents + max(_encoding(config, sizes, clips), 2 * latents + max(cached, step.predicting))
+    encoding = _encoding(config, sizes, clips) + batch_bytes(config, sizes, clips)
+    return latents + max(encoding, 2 * latents + max(cached, step.predicting))

@@ -123,7 +123,8 @@ def set_up(
 
 def _require_shared_memory(config: Config, clip: Batch, sizes: ModelSizes, accelerator: Accelerator) -> None:
     is_encoded_later = config.data.uses_cached_latents and clip.latents is None
-    size = batch_bytes(config, sizes) if is_encoded_later else clip.nbytes * config.training.batch_size
+    clips = config.training.batch_size
+    size = batch_bytes(config, sizes, clips) if is_encoded_later else clip.nbytes * clips
     nodes = all_gather_object(accelerator, platform.node())
     run_on_all(accelerator, lambda: require_shared_memory(config.data, size, nodes.count(platform.node())))
 
