@@ -139,7 +139,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     )
     files = {"MONITOR": "monitor.json", "AXES": "axes.json", "PRIOR": "prior"}
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(compilation, "missing_for_compilation", lambda _: None)
+        patched.setattr(compilation, "describe_missing_compiler", lambda _: None)
         with torch.compiler.set_stance("force_eager"):
             yield Scene(model, {name: str(folder / file) for name, file in files.items()})
 

@@ -100,7 +100,7 @@ COMPILED = IN_PARTS.model_copy(update={"compile": "blocks"})
 
 @pytest.fixture(autouse=True)
 def _with_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compilation, "missing_for_compilation", lambda _: None)
+    monkeypatch.setattr(compilation, "describe_missing_compiler", lambda _: None)
 
 
 @pytest.mark.usefixtures("traced")
@@ -118,7 +118,7 @@ def test_compiled_plans_equal_uncompiled_plans(adapted: bool, planner: str) -> N
 
 def test_missing_compiler_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     model = tiny_model()
-    monkeypatch.setattr(compilation, "missing_for_compilation", lambda kind: f"no compiler for {kind}")
+    monkeypatch.setattr(compilation, "describe_missing_compiler", lambda kind: f"no compiler for {kind}")
     with pytest.raises(InputError, match=r"no compiler for cpu.*planning.compile=off"):
         Controller(tiny_model(), COMPILED)
     Controller(model, IN_PARTS)

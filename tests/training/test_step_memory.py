@@ -83,7 +83,7 @@ def taken_by_pytorch(config: Config, sizes: ModelSizes) -> tuple[int, ...]:
         batch, matrices = clips(config, model), CastMatrices(model, dtype)
         for checkpointing in (False, True):
             model.set_gradient_checkpointing(checkpointing)
-            with matrices.current():
+            with matrices.use():
                 counting.storages.forget()
                 with arithmetic:
                     loss = torch.stack(Objective(model, config.training)(batch)).sum()

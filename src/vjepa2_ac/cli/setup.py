@@ -208,7 +208,7 @@ def _download(options: argparse.Namespace) -> None:
     )
     cli.show(f"Licence {known.licence}; from {url}; its size is checked")
     with cli.reporter() as reporter:
-        download(url, path, known=known, reporter=reporter)
+        download(url, path, published=known, reporter=reporter)
     cli.show(f"It is in {path}. In a config:  {known.config_key}: {to_config_value(path)}")
 
 

@@ -53,12 +53,12 @@ class Heads:
 
 @dataclass(frozen=True)
 class Card:
-    """The card of trained weights: their kind, and the base model they belong to."""
+    """The card of trained weights: their kind, and the base model on which they were trained."""
 
     kind: Literal["lora", "none"]
     base_predictor: str
     encoder: str
-    encoder_in_words: str  # description for users; only the fingerprint is compared
+    encoder_in_words: str  # description for messages; only the fingerprint is compared
     fresh_heads: Heads | None = None  # None: the input layers are those of the base model
 
 
@@ -88,17 +88,17 @@ def save_trained(model: WorldModel, folder: str | Path) -> None:
 
 
 def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:
-    """Load weights from `save_trained` into a base model, or into a model that is adapted already.
+    """Load weights from `save_trained` into a base model, or into a model that already has an adapter.
 
     Args:
-        model: The base model, or a model adapted in the same way, which is not wrapped again.
+        model: The base model, or a model with an adapter of the same config, which is not wrapped again.
         folder: The folder with the weights.
         trainable: Whether the weights can be trained; None keeps the state of an existing adapter and freezes a new
             one.
 
     Raises:
-        InputError: The folder contains no trained weights, is damaged, belongs to another base model, or differs from
-            the existing adapter.
+        InputError: The folder contains no trained weights or is damaged; or the weights were trained on another base
+            model, or differ in config from the existing adapter.
     """
     folder = Path(folder)
     is_new, card = model.adaptation is None, read_card(folder, model)
@@ -128,29 +128,30 @@ def _load_lora(model: WorldModel, folder: Path) -> None:
     else:
         existing = parse_adapter_config(lora_config(model).to_dict(), where=str(folder))
         for name in AdapterConfig.model_fields.keys() - {"dropout"}:
-            if (found := getattr(config, name)) != (needed := getattr(existing, name)):
-                found, needed = f"an adapter with {name} {found}", f"{needed}, as in the model"
-                raise InputError(where=str(folder), found=found, needed=needed)
+            value, expected = getattr(config, name), getattr(existing, name)
+            if value != expected:
+                problem = f"an adapter with {name} {value}"
+                raise InputError(where=str(folder), found=problem, needed=f"{expected}, as in the model")
     set_peft_model_state_dict(model.predictor, _read_weights(folder / LORA_WEIGHTS, lora_weights(model)))
 
 
 def read_card(folder: Path, model: WorldModel) -> Card:
-    """Read the card of trained weights, and check that they belong to this model.
+    """Read the card of trained weights, and check that they were trained on the base model of `model`.
 
     Raises:
-        InputError: The folder contains no trained weights or is damaged, or they belong to another base model.
+        InputError: The folder contains no trained weights or is damaged, or they were trained on another base model.
     """
     path, needed = folder / CARD, "the card of an adapter, as save_trained writes it"
     card = parse_record(Card, read_json_object(path, needed=needed), where=str(path), needed=needed)
-    own = model.adaptation.base if model.adaptation else model.predictor_fingerprint()
+    predictor = model.adaptation.base if model.adaptation else model.predictor_fingerprint()
     encoder = model.adaptation.encoder if model.adaptation else model.encoder_fingerprint()
-    for part, found, needed, trained_on, this in (
-        ("predictor", own, card.base_predictor, "", ""),
-        ("encoder", encoder, card.encoder, f": {card.encoder_in_words}", f": {model.encoder_description}"),
+    for part, in_model, in_card, model_details, card_details in (
+        ("predictor", predictor, card.base_predictor, "", ""),
+        ("encoder", encoder, card.encoder, f": {model.encoder_description}", f": {card.encoder_in_words}"),
     ):
-        if found != needed:
-            own, others = f"{found[:12]}{this}", f"{needed[:12]}{trained_on}"
-            description = f"an adapter trained on another {part} ({others}) than this model's ({own})"
+        if in_model != in_card:
+            trained_on, loaded = f"{in_card[:12]}{card_details}", f"{in_model[:12]}{model_details}"
+            description = f"an adapter trained on another {part} ({trained_on}) than this model's ({loaded})"
             fix = "Set model.base (or model.encoder) to the model on which it was trained"
             raise InputError(where=str(path), found=description, fix=fix)
     if model.adaptation is not None and model.adaptation.kind != card.kind:
@@ -159,6 +160,6 @@ def read_card(folder: Path, model: WorldModel) -> Card:
     return card
 
 
-def _read_weights(path: Path, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def _read_weights(path: Path, expected: Mapping[str, Tensor]) -> dict[str, Tensor]:
     fix = "Use an older checkpoint, or train it again"
-    return read_tensors(path, like, needed="the weights of an adapter", fix=fix)
+    return read_tensors(path, expected, needed="the weights of an adapter", fix=fix)

@@ -45,7 +45,7 @@ class RotaryTables(NamedTuple):
     """Tables with which every layer rotates queries and keys; float32, because bfloat16 would round positions."""
 
     cosine: Float32[Tensor, "sequence 1 head_dim"]
-    signed_sine: Float32[Tensor, "sequence 1 head_dim"]  # negative for the first number of a pair
+    signed_sine: Float32[Tensor, "sequence 1 head_dim"]  # sines, negated for the first number of each pair
 
 
 @lru_cache(maxsize=32)
@@ -58,15 +58,15 @@ def rotary_tables(layout: TokenLayout, head_dim: int, device: torch.device) -> R
     way. In V-JEPA 2.1 they are interleaved ([w0, w0, w1, w1, ..]).
 
     Source: facebookresearch/vjepa2 @ c2963a4, src/models/utils/modules.py, rotate_queries_or_keys and ACRoPEAttention;
-    of V-JEPA 2.1 @ 204698b, app/vjepa_2_1/models/utils/modules.py.
+    for V-JEPA 2.1 @ 204698b, app/vjepa_2_1/models/utils/modules.py.
     """
     part = 2 * ((head_dim // 3) // 2)
     # Tables made in inference mode or under FakeTensor must not end up in the cache of a training run.
     with torch.inference_mode(False), torch.no_grad():
-        places = _places(layout, device)
+        positions = _token_positions(layout, device)
         frequencies = 1.0 / THETA ** (torch.arange(part // 2, dtype=torch.float32, device=device) / (part / 2))
         pairs = frequencies.repeat_interleave(2) if layout.interleaved else frequencies.repeat(2)
-        angles = (places[..., None] * pairs).flatten(1)
+        angles = (positions[..., None] * pairs).flatten(1)
         angles = torch.nn.functional.pad(angles, (0, head_dim - 3 * part))
         sign = torch.tensor([-1.0, 1.0], device=device).repeat((head_dim + 1) // 2)[:head_dim]
         return RotaryTables(angles.cos()[:, None], (angles.sin() * sign)[:, None])
@@ -86,31 +86,31 @@ class _Rotation(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
         ctx.save_for_backward(cosine, signed_sine)
-        return _turned(tokens, cosine, signed_sine)
+        return _rotate_pairs(tokens, cosine, signed_sine)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         cosine, signed_sine = ctx.saved_tensors
-        return _turned(gradient, cosine, _swapped(signed_sine)), None, None
+        return _rotate_pairs(gradient, cosine, _swap_pairs(signed_sine)), None, None
 
 
-def _turned(tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
+def _rotate_pairs(tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
     # `out` lets addcmul compute in float32 and write in the data type of the tokens, without a further pass for a cast.
     # A compiler fuses this pass by itself. In compiled code torch 2.11 loses the gradient of a tensor that an
     # autograd.Function writes in place and returns (PyTorch issue 180642), even after a cast that changes nothing.
     if torch.compiler.is_compiling():
-        turned = torch.addcmul(tokens * cosine, _swapped(tokens), signed_sine)
-        return turned if turned.dtype == tokens.dtype else turned.to(tokens.dtype)
-    turned = torch.empty_like(tokens)
-    return torch.addcmul(tokens * cosine, _swapped(tokens), signed_sine, out=turned)
+        rotated = torch.addcmul(tokens * cosine, _swap_pairs(tokens), signed_sine)
+        return rotated if rotated.dtype == tokens.dtype else rotated.to(tokens.dtype)
+    rotated = torch.empty_like(tokens)
+    return torch.addcmul(tokens * cosine, _swap_pairs(tokens), signed_sine, out=rotated)
 
 
-def _swapped(tokens: Tensor) -> Tensor:
+def _swap_pairs(tokens: Tensor) -> Tensor:
     """Return the tokens with the two numbers of each pair swapped."""
     return torch.stack((tokens[..., 1::2], tokens[..., 0::2]), dim=-1).flatten(-2)
 
 
-def _places(layout: TokenLayout, device: torch.device) -> Float32[Tensor, "sequence 3"]:
+def _token_positions(layout: TokenLayout, device: torch.device) -> Float32[Tensor, "sequence 3"]:
     """Return the positions (time, height, width) of all tokens; conditioning tokens have height and width 0."""
     grid = torch.arange(layout.grid, dtype=torch.float32, device=device)
     if layout.scaled_to is not None:
@@ -159,20 +159,20 @@ def _dense(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> T
 
 
 def _per_step(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
-    before = key.shape[2] - query.shape[2]
-    ends = tuple(range(before + tokens_per_step, key.shape[2] + 1, tokens_per_step))
+    num_cached = key.shape[2] - query.shape[2]
+    ends = tuple(range(num_cached + tokens_per_step, key.shape[2] + 1, tokens_per_step))
     parts = torch.split(query, tokens_per_step, dim=2)
-    beginnings: Callable[..., tuple[Tensor, ...]] = _Beginnings.apply
-    steps = zip(parts, beginnings(key, ends), beginnings(value, ends), strict=True)
-    seen = [scaled_dot_product_attention(*inputs) for inputs in steps]
-    return seen[0] if len(seen) == 1 else torch.cat(seen, dim=2)
+    prefixes: Callable[..., tuple[Tensor, ...]] = _Prefixes.apply
+    steps = zip(parts, prefixes(key, ends), prefixes(value, ends), strict=True)
+    outputs = [scaled_dot_product_attention(*inputs) for inputs in steps]
+    return outputs[0] if len(outputs) == 1 else torch.cat(outputs, dim=2)
 
 
-class _Beginnings(torch.autograd.Function):
-    """The first tokens of keys or values up to each end, as views: nothing is copied.
+class _Prefixes(torch.autograd.Function):
+    """The prefixes of keys or values up to each end, as views without copies.
 
-    With plain slices, the gradient of each would be padded with zeros to the full length before it is added to the
-    others; here it is added in place.
+    With plain slices, the gradient of each prefix would be padded with zeros to the full length before the gradients
+    are added. Here each gradient is added in place.
     """
 
     @staticmethod
@@ -180,8 +180,8 @@ class _Beginnings(torch.autograd.Function):
         return tuple(values[:, :, :end] for end in ends)
 
     @staticmethod
-    def backward(_ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:  # the last is of all tokens
-        total = gradients[-1].clone()
+    def backward(_ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        total = gradients[-1].clone()  # the last prefix contains all tokens
         for gradient in gradients[:-1]:
             total[:, :, : gradient.shape[2]] += gradient
         return total, None
@@ -207,10 +207,10 @@ def _dense_mask(steps: int, tokens_per_step: int, device: torch.device) -> Bool[
 def _flex_mask(queries: int, keys: int, tokens_per_step: int, device: torch.device) -> Any:
     from torch.nn.attention.flex_attention import create_block_mask
 
-    before = keys - queries
+    num_cached = keys - queries
     with torch.inference_mode(False):
         return create_block_mask(
-            lambda _batch, _head, query, key: (before + query) // tokens_per_step >= key // tokens_per_step,
+            lambda _batch, _head, query, key: (num_cached + query) // tokens_per_step >= key // tokens_per_step,
             None,
             None,
             queries,

@@ -14,11 +14,17 @@ from vjepa2_ac.model.compilation import When, compile_function
 
 NORM_EPSILON = 1e-6
 INIT_STD = 0.02
-_PLAIN = "training.compile=off (planning.compile=off)"  # blocks are not compiled
+_COMPILE_OFF = "training.compile=off (planning.compile=off)"  # the settings without compilation, for messages
 
 
 class OutputLinear(nn.Linear):
-    """A linear layer whose output is added to the residual; initial weights are divided by sqrt(2 * layer), from 1."""
+    """A linear layer whose output is added to the residual; its initial std is divided by sqrt(2 * layer).
+
+    Args:
+        inputs: Width of the input.
+        outputs: Width of the output.
+        layer: Number of the block, counted from 1.
+    """
 
     def __init__(self, inputs: int, outputs: int, layer: int) -> None:
         super().__init__(inputs, outputs)
@@ -59,18 +65,18 @@ class Mlp(nn.Module):
         self.fc2 = OutputLinear(hidden, width, layer)
 
     def forward(self, tokens: Float[Tensor, "*batch width"]) -> Float[Tensor, "*batch width"]:
-        """Return each token, transformed independently."""
+        """Transform each token independently."""
         return self.fc2(self.activation(self.fc1(tokens)))  # type: ignore[no-any-return]  # nn.Module is untyped
 
 
 class Block(nn.Module):
-    """Attention and MLP, each on normalised tokens, each added to its input.
+    """A pre-norm transformer block: attention, then an MLP.
 
     A block has no state, because gradient checkpointing computes it twice: keys and values of earlier steps are
     arguments, and those for later steps are returned.
 
     Args:
-        layer: Number of the block, from 1.
+        layer: Number of the block, counted from 1.
     """
 
     def __init__(self, width: int, heads: int, hidden: int, layer: int) -> None:
@@ -103,16 +109,15 @@ class Block(nn.Module):
         """
         before, after = _before_attention, _after_attention
         if self.compiled == "always" or (self.compiled == "with gradients" and torch.is_grad_enabled()):
-            before = compile_function(before, override=_PLAIN)
-            after = compile_function(after, override=_PLAIN)
+            before = compile_function(before, override=_COMPILE_OFF)
+            after = compile_function(after, override=_COMPILE_OFF)
         query, key, value = before(self, tokens, tables)
-        kept = (
-            torch.stack((key[:, :, :keep], value[:, :, :keep])) if keep else None
-        )  # a copy, so that the rest is freed
+        # A copy, so that the memory of all other keys and values can be freed.
+        saved = torch.stack((key[:, :, :keep], value[:, :, :keep])) if keep else None
         if past:
             key, value = torch.cat((*past, torch.stack((key, value))), dim=3)
-        gathered = block_causal_attention(query, key, value, tokens_per_step, kind)
-        return after(self, tokens, gathered), kept
+        attended = block_causal_attention(query, key, value, tokens_per_step, kind)
+        return after(self, tokens, attended), saved
 
 
 def initialise(module: nn.Module, generator: Generator | None = None) -> None:
@@ -136,32 +141,34 @@ def output_std(layer: int) -> float:
 
 
 def _before_attention(block: Block, tokens: Tensor, tables: RotaryTables) -> tuple[Tensor, Tensor, Tensor]:
-    return block.attn.project(normalised(block.norm1, tokens), tables)
+    return block.attn.project(apply_norm(block.norm1, tokens), tables)
 
 
-def _after_attention(block: Block, tokens: Tensor, gathered: Tensor) -> Tensor:
-    tokens = tokens + block.attn.o(gathered.transpose(1, 2).flatten(2))
-    return tokens + block.mlp(normalised(block.norm2, tokens))  # type: ignore[no-any-return]  # nn.Module is untyped
+def _after_attention(block: Block, tokens: Tensor, attended: Tensor) -> Tensor:
+    tokens = tokens + block.attn.o(attended.transpose(1, 2).flatten(2))
+    return tokens + block.mlp(apply_norm(block.norm2, tokens))  # type: ignore[no-any-return]  # nn.Module is untyped
 
 
-def normalised(norm: nn.LayerNorm, tokens: Tensor) -> Tensor:
-    """Return normalised tokens, cast once to the type of all following layers."""
-    kind = tokens.device.type
-    if not torch.is_autocast_enabled(kind):
+def apply_norm(norm: nn.LayerNorm, tokens: Tensor) -> Tensor:
+    """Return normalised tokens, cast once to the data type of all following layers."""
+    device_type = tokens.device.type
+    if not torch.is_autocast_enabled(device_type):
         return norm(tokens)  # type: ignore[no-any-return]  # nn.Module is untyped
     with without_needless_autocast(tokens, norm.weight):
-        return norm(tokens).to(torch.get_autocast_dtype(kind))  # type: ignore[no-any-return]  # the same
+        return norm(tokens).to(torch.get_autocast_dtype(device_type))  # type: ignore[no-any-return]  # nn.Module is untyped
 
 
 def without_needless_autocast(tokens: Tensor, weights: Tensor) -> AbstractContextManager[object]:
     """Disable autocast if tokens and weights have its data type already.
 
-    Autocast would then only compute norms from a float32 copy, and each following layer would cast the result back.
-    Norm kernels compute in float32 anyway, so that the numbers are the same with a fifth of the bytes.
+    Autocast would then compute norms from a float32 copy, and each following layer would cast the result back. Norm
+    kernels compute in float32 in any case, so that the result is the same with a fifth of the memory traffic.
     """
-    kind = tokens.device.type
-    if torch.is_autocast_enabled(kind) and tokens.dtype == weights.dtype == torch.get_autocast_dtype(kind):
-        return torch.autocast(kind, enabled=False)
+    device_type = tokens.device.type
+    if torch.is_autocast_enabled(device_type) and tokens.dtype == weights.dtype == torch.get_autocast_dtype(
+        device_type
+    ):
+        return torch.autocast(device_type, enabled=False)
     return nullcontext()
 
 
@@ -170,8 +177,8 @@ def hidden_width(width: int, mlp_ratio: float) -> int:
     return int(width * mlp_ratio)
 
 
-def mlp_ratio_of(width: int, hidden: int, expected: float) -> float:
-    """Return a ratio for which `hidden_width` returns `hidden`; the expected ratio if it fits."""
+def find_mlp_ratio(width: int, hidden: int, expected: float) -> float:
+    """Return a ratio for which `hidden_width` returns `hidden`: the expected ratio, if possible."""
     if hidden_width(width, expected) == hidden:
         return expected
     exact = hidden / width

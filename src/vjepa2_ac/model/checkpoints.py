@@ -26,7 +26,7 @@ from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes
 from vjepa2_ac.config.model import Depth, EncoderConfig, Family, FramePath, Heads, Ratio, Width
 from vjepa2_ac.episode import POSE_WIDTHS
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.blocks import mlp_ratio_of
+from vjepa2_ac.model.blocks import find_mlp_ratio
 from vjepa2_ac.model.model_files import (
     CONFIG,
     ENCODER_NEEDED,
@@ -53,22 +53,26 @@ ENCODER_KEYS = ("ema_encoder", "target_encoder", "encoder")
 `encoder` contains the weights that were trained by gradient descent."""
 FIX = "`vjepa2-ac download --list` shows the published files; the Hub has facebook/vjepa2-vitl-fpc64-256"
 
-Part = Family | Literal["predictor"]  # whose names
+Part = Family | Literal["predictor"]  # parts of a model that differ in the names of their tensors
 Rename = Callable[[str], tuple[str, int | None]]
 """Our name of a tensor -> name in the file, and which third of a fused tensor it is (None: the whole tensor)."""
 
-_PARTS = 'both parts, as of torch.save({"encoder": ..., "predictor": ...}, FILE), or model.encoder.path for the encoder'
+_PARTS = (
+    'both parts, as written by torch.save({"encoder": ..., "predictor": ...}, FILE),'
+    " or model.encoder.path for the encoder"
+)
 _NEEDED = "a checkpoint of V-JEPA 2, 2.1 or 2-AC as Meta publishes it"
 _SPLIT = ("q", "k", "v")
-_PREFIXES = re.compile(r"^(?:(?:module|backbone|_orig_mod)\.)+|_orig_mod\.")  # the last: of torch.compile, anywhere
-_IGNORED = "pos_embed"  # may be in a file: a network with rotary positions does not use it
+# Prefixes of DDP and of Meta's wrapper are at the start of a name; torch.compile's prefix can be inside.
+_PREFIXES = re.compile(r"^(?:(?:module|backbone|_orig_mod)\.)+|_orig_mod\.")
+_IGNORED = "pos_embed"  # may be in a file, but a network with rotary positions does not use it
 _ENCODER = [
     (r"^vit\.embeddings\.patch_embeddings\.", "patch_embed."),
     (r"^vit\.layer\.", "blocks."),
     (r"\.attention\.(q|k|v)(?:uery|ey|alue)\.", r".attn.\1."),
     (r"\.attention\.proj\.", ".attn.proj."),
 ]
-_NAMES: dict[Part, list[tuple[str, str]]] = {  # ours -> Meta's, as (pattern, replacement), applied in turn
+_NAMES: dict[Part, list[tuple[str, str]]] = {  # our name -> Meta's, as (pattern, replacement), applied in this order
     "v2": [(r"^vit\.layernorm\.", "norm."), *_ENCODER],
     "v2.1": [
         (r"^vit\.layernorm\.", "norms_block.3."),
@@ -80,37 +84,38 @@ _NAMES: dict[Part, list[tuple[str, str]]] = {  # ours -> Meta's, as (pattern, re
     ],
     "predictor": [(r"^blocks\.", "predictor_blocks."), (r"\.attn\.o\.", ".attn.proj.")],
 }
-_ON_THE_HUB = [CONFIG, "*.safetensors"]
-_PREFIXES_ON_THE_HUB = ("vjepa2.encoder.", "encoder.")  # of a classification model, of a plain one
-_BLOCK = re.compile(r"(?:^|\.)(?:blocks|layer)\.(\d+)\.")  # in the names of Meta's files, of transformers, and of ours
-_ONLY_2_1 = ("norms_block.", "video_mod_embed", "img_mod_embed", "patch_embed_img.")
+_HUB_PATTERNS = [CONFIG, "*.safetensors"]
+_HUB_PREFIXES = ("vjepa2.encoder.", "encoder.")  # of a classification model and of a plain model
+_BLOCK = re.compile(r"(?:^|\.)(?:blocks|layer)\.(\d+)\.")  # matches the names of Meta, transformers and this project
+_V2_1_PREFIXES = ("norms_block.", "video_mod_embed", "img_mod_embed", "patch_embed_img.")
 _NON_COMMERCIAL = "Such weights from jepa-wms have the licence CC-BY-NC 4.0: for non-commercial use only"
 
 
 def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
     """Return the base model on the CPU.
 
-    It is `model.base`; for `random`, a new predictor of `model.sizes` with `model.encoder` or with a random encoder.
+    The model is read from `model.base`. For `random` it has a new predictor of the sizes in `model.sizes`, and the
+    encoder in `model.encoder` or else a random encoder.
 
     Raises:
-        InputError: There is no such model or encoder, it cannot be read, or contradicts the config.
+        InputError: The model or the encoder does not exist, cannot be read, or contradicts the config.
     """
     dtype = torch.bfloat16 if config.dtype == "bfloat16" else torch.float32
     encoder = None if config.encoder is None else find_encoder(config.encoder)
     if config.is_random:
         if encoder is None:
             return WorldModel.random(config.sizes.model_sizes, seed, dtype, near_persistence=True)
-        model = _on_encoder(encoder, get_sizes_with_encoder(encoder, config.sizes.model_sizes), dtype)
+        model = _build_with_encoder(encoder, get_sizes_with_encoder(encoder, config.sizes.model_sizes), dtype)
         model.draw_predictor(torch.Generator().manual_seed(seed), dtype, near_persistence=True)
         return model
     path = find_base(config.base)
     file = None if path.is_dir() else MetaFile.open(path)
     if encoder is not None and (file is None or any(key in file.parts for key in ENCODER_KEYS)):
-        said = f"a model with an encoder, and model.encoder sets another one ({encoder.where})"
+        problem = f"a model with an encoder, and model.encoder sets another one ({encoder.where})"
         fix = "Remove model.encoder; or train a new predictor on that encoder, with model.base: random"
-        raise InputError(where=f"model.base: {config.base}", found=said, fix=fix)
+        raise InputError(where=f"model.base: {config.base}", found=problem, fix=fix)
     if file is not None:
-        return _of_meta(file, encoder, config.sizes.model_sizes, dtype)
+        return _load_meta_file(file, encoder, config.sizes.model_sizes, dtype)
     check_sizes(read_sizes(path), config.sizes.model_sizes, where=f"model.base: {config.base}")
     return WorldModel.from_pretrained(path, dtype=dtype)
 
@@ -118,7 +123,7 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
 def base_sizes(config: ModelConfig) -> ModelSizes:
     """Return the sizes of the model that `load_base` would return, without reading weights.
 
-    For an official `.pt`, or if the model does not exist yet, they are those of `model.sizes`.
+    For an official `.pt`, or if the model does not exist yet, the sizes are those in `model.sizes`.
 
     Raises:
         InputError: The folder is not a world model; or `model.encoder` is not an encoder.
@@ -127,8 +132,8 @@ def base_sizes(config: ModelConfig) -> ModelSizes:
         return get_expected_sizes(config.encoder, config.sizes.model_sizes)
     if config.is_random:
         return config.sizes.model_sizes
-    is_there = config.base.startswith(BUILTIN) or Path(config.base).exists()
-    path = find_base(config.base) if is_there else Path(config.base)
+    exists = config.base.startswith(BUILTIN) or Path(config.base).exists()
+    path = find_base(config.base) if exists else Path(config.base)
     return read_sizes(path) if path.is_dir() else config.sizes.model_sizes
 
 
@@ -136,19 +141,19 @@ def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torc
     """Load Meta's checkpoint. Every tensor must match, except a `pos_embed` of the encoder.
 
     The file is memory-mapped: in addition to the weights in `dtype`, memory contains only pages of the file, which the
-    system can free. If there are several encoders, the first of `ENCODER_KEYS` is used: Meta's code trains the
-    predictor on `target_encoder`.
+    system can free. If the file contains several encoders, the first of `ENCODER_KEYS` is used, because Meta's code
+    trains the predictor on `target_encoder`.
 
     Args:
         path: The `.pt` file.
         sizes: Sizes that the tensors do not determine: image size, heads, extrinsics. Any other size must be the
-            default or that of the tensors.
+            default or equal the size of the tensors.
         dtype: Data type of the weights in memory.
 
     Raises:
         InputError: The file is missing, truncated, of another kind, contradicts the sizes, or a weight is not finite.
     """
-    return _of_meta(MetaFile.open(Path(path)), None, sizes or ModelSizes(), dtype)
+    return _load_meta_file(MetaFile.open(Path(path)), None, sizes or ModelSizes(), dtype)
 
 
 def to_official(model: WorldModel) -> dict[str, Any]:
@@ -174,16 +179,18 @@ def to_official(model: WorldModel) -> dict[str, Any]:
     }
 
 
-def _of_meta(file: MetaFile, encoder: EncoderSource | None, given: ModelSizes, dtype: torch.dtype) -> WorldModel:
-    """Return a model with the predictor in a file and an encoder; None: the encoder in the file."""
-    found = encoder or encoder_in_file(file, None, given.encoder.frame, given.encoder.heads)
+def _load_meta_file(
+    file: MetaFile, encoder: EncoderSource | None, configured: ModelSizes, dtype: torch.dtype
+) -> WorldModel:
+    """Return a model with the predictor in a file and an encoder; if it is None, with the encoder in the file."""
+    source = encoder or find_encoder_in_file(file, None, configured.encoder.frame, configured.encoder.heads)
     predictor = file.tensors("predictor")
     if "mask_tokens" in {name.partition(".")[0] for name in predictor} and "action_encoder.weight" not in predictor:
-        said = "a checkpoint of pre-training, whose predictor has no action input"
+        problem = "a checkpoint of pre-training, whose predictor has no action input"
         fix = "Its encoder can be used: set model.encoder.path to this file, and model.base: random for a new"
         fix += " predictor (configs/scratch_vitb.yaml)"
-        raise InputError(where=f"model.base: {file.path}", found=said, fix=fix)
-    model = _on_encoder(found, _sizes(file, predictor, found, given), dtype)
+        raise InputError(where=f"model.base: {file.path}", found=problem, fix=fix)
+    model = _build_with_encoder(source, _merge_sizes(file, predictor, source, configured), dtype)
     load_weights(
         model.predictor,
         predictor,
@@ -194,7 +201,7 @@ def _of_meta(file: MetaFile, encoder: EncoderSource | None, given: ModelSizes, d
     )
     logger.info("read %s: %s", file.path, model.sizes.model_dump())
     if encoder is None:
-        model.encoder_origin = None  # the file is the model's own
+        model.encoder_origin = None  # the encoder and the predictor are from the same file
         return model
     if not model.sizes.predictor.use_states:
         logger.warning("%s: a predictor without states and without an encoder. %s", file.path, _NON_COMMERCIAL)
@@ -207,42 +214,44 @@ def _of_meta(file: MetaFile, encoder: EncoderSource | None, given: ModelSizes, d
     return model
 
 
-def _on_encoder(found: EncoderSource, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
+def _build_with_encoder(source: EncoderSource, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
     """Return a model with this encoder, and a predictor without weights."""
     model = WorldModel.empty(sizes)
     fix = f"Get the original file. {FIX}"
-    load_weights(model.loaded_encoder, found.weights(), found.rename, dtype, where=found.where, fix=fix)
-    if found.is_truncated:
+    load_weights(model.loaded_encoder, source.weights(), source.rename, dtype, where=source.where, fix=fix)
+    if source.is_truncated:
         model.loaded_encoder.reset_last_norm()
-    model.encoder_origin = found.origin
+    model.encoder_origin = source.origin
     return model
 
 
-def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: EncoderSource, given: ModelSizes) -> ModelSizes:
-    """Return the sizes of the tensors; heads, image size and extrinsics are taken from `given`."""
-    own = given.predictor
+def _merge_sizes(
+    file: MetaFile, predictor: Mapping[str, Tensor], encoder: EncoderSource, configured: ModelSizes
+) -> ModelSizes:
+    """Return the sizes of the tensors; heads, image size and extrinsics are taken from `configured`."""
+    predictor_config = configured.predictor
     try:
         width, hidden = len(predictor["action_encoder.weight"]), len(predictor["predictor_blocks.0.mlp.fc1.weight"])
         depth = count_blocks(predictor, "predictor_blocks")
     except KeyError as missing:
         raise file.missing_error(f"tensor {missing}", part="predictor") from None
     fields = {
-        "image_size": given.image_size,
+        "image_size": configured.image_size,
         "patch_size": encoder.patch_size,
         "encoder": encoder.sizes.model_dump(),
         "predictor": {
             "width": width,
             "depth": depth,
-            "heads": own.heads,
-            "mlp_ratio": mlp_ratio_of(width, hidden, own.mlp_ratio),
-            "use_extrinsics": own.use_extrinsics,
+            "heads": predictor_config.heads,
+            "mlp_ratio": find_mlp_ratio(width, hidden, predictor_config.mlp_ratio),
+            "use_extrinsics": predictor_config.use_extrinsics,
             "use_states": any(name.startswith("state_encoder.") for name in predictor),
         },
     }
     fix = "Set image size and heads in model.sizes: the tensors do not determine them"
-    found = parse_record(ModelSizes, fields, where=str(file.path), needed="sizes that go with model.sizes", fix=fix)
-    check_sizes(found, given, where=str(file.path))
-    return found
+    sizes = parse_record(ModelSizes, fields, where=str(file.path), needed="sizes that go with model.sizes", fix=fix)
+    check_sizes(sizes, configured, where=str(file.path))
+    return sizes
 
 
 # ---- encoders ----
@@ -250,22 +259,22 @@ def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: EncoderSour
 
 @dataclass(frozen=True, eq=False)
 class EncoderSource:
-    """An encoder in a file or folder, whose values are not read yet."""
+    """An encoder in a file or folder, whose weights are not read yet."""
 
     where: str  # for messages
     sizes: EncoderSizes
     patch_size: int
-    image_size: int | None  # of the last training, if it is known
+    image_size: int | None  # in the last phase of training, if it is known
     origin: EncoderOrigin
-    weights: Callable[[], Mapping[str, Tensor]]  # mapped, by the file's names
+    weights: Callable[[], Mapping[str, Tensor]]  # memory-mapped, by their names in the file
     rename: Rename
-    is_truncated: bool = False  # without its last blocks: then the last norm has no trained weights
+    is_truncated: bool = False  # whether the last blocks are removed; the last norm then has no trained weights
 
     def truncate(self, layer: int) -> EncoderSource:
         """Return the same encoder without the blocks after a layer.
 
         Raises:
-            InputError: The encoder has fewer blocks.
+            InputError: The encoder has fewer blocks than `layer`.
         """
         depth = self.sizes.depth
         if layer > depth:
@@ -290,49 +299,53 @@ def find_encoder(config: EncoderConfig) -> EncoderSource:
     """
     path = find_encoder_path(config.path)
     if path is not None and not path.is_dir():
-        found = encoder_in_file(MetaFile.open(path), config.key, config.frame, config.heads)
+        source = find_encoder_in_file(MetaFile.open(path), config.key, config.frame, config.heads)
     else:
-        folder = path or download_from_hub(config.path, _ON_THE_HUB, where=f"model.encoder.path: {config.path}")
+        folder = path or download_from_hub(config.path, _HUB_PATTERNS, where=f"model.encoder.path: {config.path}")
         name = config.path if path is None else path.name
-        found = _in_folder(folder, config, name=name)
-    if config.heads not in {None, found.sizes.heads}:
-        said = f"{found.sizes.heads} attention heads, and model.encoder.heads is {config.heads}"
-        raise InputError(where=found.where, found=said, fix="Remove model.encoder.heads")
-    return found if config.layer is None else found.truncate(config.layer)
+        source = _find_encoder_in_folder(folder, config, name=name)
+    if config.heads not in {None, source.sizes.heads}:
+        problem = f"{source.sizes.heads} attention heads, and model.encoder.heads is {config.heads}"
+        raise InputError(where=source.where, found=problem, fix="Remove model.encoder.heads")
+    return source if config.layer is None else source.truncate(config.layer)
 
 
-def get_sizes_with_encoder(found: EncoderSource, given: ModelSizes) -> ModelSizes:
-    """Return the sizes of a model with this encoder, at the given image size.
+def get_sizes_with_encoder(source: EncoderSource, configured: ModelSizes) -> ModelSizes:
+    """Return the sizes of a model with this encoder, at the configured image size.
 
     Raises:
-        InputError: The given sizes contradict those of the file, or do not fit its patches, frame path or heads.
+        InputError: The configured sizes contradict those of the file, or do not fit its patches, frame path or heads.
     """
-    own = {"encoder": found.sizes.model_dump(), "patch_size": found.patch_size}
-    sizes = parse_record(ModelSizes, given.model_dump() | own, where=found.where, needed=ENCODER_NEEDED)
-    check_sizes(sizes, given, where=found.where)
-    if found.image_size not in {None, given.image_size}:
+    encoder_values = {"encoder": source.sizes.model_dump(), "patch_size": source.patch_size}
+    sizes = parse_record(
+        ModelSizes, configured.model_dump() | encoder_values, where=source.where, needed=ENCODER_NEEDED
+    )
+    check_sizes(sizes, configured, where=source.where)
+    if source.image_size not in {None, configured.image_size}:
         logger.warning(
             "%s was trained at %d px, and frames are encoded at %d px (image_size), at untrained positions",
-            found.origin, found.image_size, given.image_size,
+            source.origin, source.image_size, configured.image_size,
         )  # fmt: skip
     return sizes
 
 
-def get_expected_sizes(config: EncoderConfig, given: ModelSizes) -> ModelSizes:
+def get_expected_sizes(config: EncoderConfig, configured: ModelSizes) -> ModelSizes:
     """Return the sizes of a model with this encoder; for a published file that is not downloaded yet, from its name.
 
     Raises:
         InputError: See `find_encoder`.
     """
-    known = find_published_file(Path(config.path).name)
-    if known is None or Path(config.path).exists():
-        return get_sizes_with_encoder(find_encoder(config), given)
-    encoder = known.encoder.sizes(known.family, config.frame).model_dump()
+    published = find_published_file(Path(config.path).name)
+    if published is None or Path(config.path).exists():
+        return get_sizes_with_encoder(find_encoder(config), configured)
+    encoder = published.encoder.sizes(published.family, config.frame).model_dump()
     encoder["depth"] = min(encoder["depth"], config.layer or encoder["depth"])
-    return parse_record(ModelSizes, given.model_dump() | {"encoder": encoder}, where=f"model.encoder: {config.path}")
+    return parse_record(
+        ModelSizes, configured.model_dump() | {"encoder": encoder}, where=f"model.encoder: {config.path}"
+    )
 
 
-def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: int | None) -> EncoderSource:
+def find_encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: int | None) -> EncoderSource:
     """Return the encoder in one of Meta's files.
 
     Args:
@@ -344,15 +357,15 @@ def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: in
     Raises:
         InputError: There is no such key, its value is not an encoder, or the number of heads is not known.
     """
-    there = [name for name in ENCODER_KEYS if name in file.parts]
-    if key is None and there:
-        key = there[0]
-        logger.info("%s: the encoder under %s (there are: %s)", file.path, key, ", ".join(there))
-    if key not in there:
-        fix = f"Set model.encoder.key to one of {', '.join(there)}, or leave it out" if there else FIX
+    available = [name for name in ENCODER_KEYS if name in file.parts]
+    if key is None and available:
+        key = available[0]
+        logger.info("%s: the encoder under %s (there are: %s)", file.path, key, ", ".join(available))
+    if key not in available:
+        fix = f"Set model.encoder.key to one of {', '.join(available)}, or leave it out" if available else FIX
         raise file.missing_error(key or "encoder", fix)
     tensors = file.tensors(key)
-    family: Family = "v2.1" if any(name.startswith(_ONLY_2_1) for name in tensors) else "v2"
+    family: Family = "v2.1" if any(name.startswith(_V2_1_PREFIXES) for name in tensors) else "v2"
     try:
         width, *_, patch_size = tensors["patch_embed.proj.weight"].shape
         hidden, depth = tensors["blocks.0.mlp.fc1.weight"].shape[0], count_blocks(tensors, "blocks")
@@ -360,25 +373,25 @@ def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: in
         raise file.missing_error(f"tensor {missing}", part=key) from None
     heads = PUBLISHED_HEADS.get(width, heads)
     if heads is None:
-        said = f"an encoder of width {width}, which no published encoder has: its number of heads is not known"
+        problem = f"an encoder of width {width}, which no published encoder has: its number of heads is not known"
         fix = (
             "Set model.encoder.heads to the number used in its training; a wrong number causes wrong latents, no error"
         )
-        raise InputError(where=str(file.path), found=said, fix=fix)
-    known = find_published_file(file.path.name)
+        raise InputError(where=str(file.path), found=problem, fix=fix)
+    published = find_published_file(file.path.name)
     return EncoderSource(
         where=f"{file.path}: {key}",
         sizes=EncoderSizes(
             width=width,
             depth=depth,
             heads=heads,
-            mlp_ratio=mlp_ratio_of(width, hidden, EncoderSizes().mlp_ratio),
+            mlp_ratio=find_mlp_ratio(width, hidden, EncoderSizes().mlp_ratio),
             family=family,
             frame=frame,
         ),
         patch_size=patch_size,
-        image_size=known.image_size if known else None,
-        origin=EncoderOrigin(file.path.name, key, known.licence if known else ""),
+        image_size=published.image_size if published else None,
+        origin=EncoderOrigin(file.path.name, key, published.licence if published else ""),
         weights=lambda: tensors,
         rename=partial(to_official_name, part=family),
     )
@@ -401,14 +414,14 @@ class _TransformersConfig(BaseModel):
     layer_norm_eps: Annotated[float, Field(ge=0.99e-6, le=1.01e-6)] = 1e-6
 
 
-def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> EncoderSource:
+def _find_encoder_in_folder(folder: Path, config: EncoderConfig, *, name: str) -> EncoderSource:
     """Return the encoder in a folder of transformers or of this project; `name` is the value from the config."""
     card = read_json_object(folder / CONFIG, needed=ENCODER_NEEDED, fix=FIX)
     if config.key is not None:
-        found = f"{name}, a folder, which contains one encoder"
-        raise InputError(where=f"model.encoder.key: {config.key}", found=found, fix="Remove the key")
+        problem = f"{name}, a folder, which contains one encoder"
+        raise InputError(where=f"model.encoder.key: {config.key}", found=problem, fix="Remove the key")
     if card.get("format") != FORMAT:
-        return _of_transformers(folder, card, config.frame, name)
+        return _find_transformers_encoder(folder, card, config.frame, name)
     model = read_sizes(folder)
     return EncoderSource(
         where=str(folder / ENCODER),
@@ -416,20 +429,20 @@ def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> EncoderSour
         patch_size=model.patch_size,
         image_size=model.image_size,
         origin=read_encoder_origin(folder)
-        or EncoderOrigin(name, has_heads_in_fingerprint=False),  # keeps the fingerprint
-        weights=partial(_mapped, [folder / ENCODER]),
+        or EncoderOrigin(name, has_heads_in_fingerprint=False),  # the fingerprint stays that of the model in the folder
+        weights=partial(_map_safetensors, [folder / ENCODER]),
         rename=lambda ours: (ours, None),
     )
 
 
-def _of_transformers(folder: Path, card: Mapping[str, Any], frame: FramePath, name: str) -> EncoderSource:
+def _find_transformers_encoder(folder: Path, card: Mapping[str, Any], frame: FramePath, name: str) -> EncoderSource:
     """Return the encoder of a plain or a classification model of transformers, without masked predictor and head."""
     fields = parse_record(_TransformersConfig, card, where=str(folder / CONFIG), needed=ENCODER_NEEDED, fix=FIX)
-    tensors = _mapped(sorted(folder.glob("*.safetensors")))
-    prefix = next((one for one in _PREFIXES_ON_THE_HUB if any(tensor.startswith(one) for tensor in tensors)), None)
+    tensors = _map_safetensors(sorted(folder.glob("*.safetensors")))
+    prefix = next((text for text in _HUB_PREFIXES if any(name.startswith(text) for name in tensors)), None)
     if prefix is None:
-        found = "no tensor of an encoder in *.safetensors"
-        raise InputError(where=str(folder), found=found, needed=ENCODER_NEEDED, fix=FIX)
+        problem = "no tensor of an encoder in *.safetensors"
+        raise InputError(where=str(folder), found=problem, needed=ENCODER_NEEDED, fix=FIX)
     return EncoderSource(
         where=str(folder),
         sizes=EncoderSizes(
@@ -442,18 +455,18 @@ def _of_transformers(folder: Path, card: Mapping[str, Any], frame: FramePath, na
         patch_size=fields.patch_size,
         image_size=fields.crop_size,
         origin=EncoderOrigin(name),
-        weights=lambda: {one: value for one, value in tensors.items() if one.startswith(prefix)},
+        weights=lambda: {key: value for key, value in tensors.items() if key.startswith(prefix)},
         rename=lambda ours: (prefix + ours.removeprefix("vit."), None),
     )
 
 
-def _mapped(files: list[Path]) -> dict[str, Tensor]:
+def _map_safetensors(files: list[Path]) -> dict[str, Tensor]:
     """Return the memory-mapped tensors of safetensors files; values are read when they are used."""
-    found: dict[str, Tensor] = {}
+    tensors: dict[str, Tensor] = {}
     for path in files:
         with open_safetensors(path, needed=ENCODER_NEEDED) as file:
-            found |= {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no iterator
-    return found
+            tensors |= {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # safetensors' file has no iterator
+    return tensors
 
 
 # ---- Meta's files ----
@@ -476,15 +489,15 @@ class MetaFile:
         """
         with storage.translate_read_errors(path, needed=_NEEDED, fix=FIX):
             try:
-                whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-            except Exception as error:  # a damaged pickle raises errors of any type
+                content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+            except Exception as error:  # a damaged pickle can raise any type of error
                 if storage.is_os_read_error(error):
                     raise
-                found, fix = _problem_of(path, error)
-                raise InputError(where=str(path), found=found, needed=_NEEDED, fix=fix) from None
-        if not isinstance(whole, dict):
-            raise InputError(where=str(path), found=f"a {type(whole).__name__}", needed=_NEEDED, fix=FIX)
-        return cls(path, {str(key): value for key, value in whole.items()})
+                problem, fix = _describe_unreadable_file(path, error)
+                raise InputError(where=str(path), found=problem, needed=_NEEDED, fix=fix) from None
+        if not isinstance(content, dict):
+            raise InputError(where=str(path), found=f"a {type(content).__name__}", needed=_NEEDED, fix=FIX)
+        return cls(path, {str(key): value for key, value in content.items()})
 
     def tensors(self, key: str) -> dict[str, Tensor]:
         """Return the tensors of a part by Meta's names without prefixes.
@@ -500,11 +513,11 @@ class MetaFile:
         require_floats(named, where=f"{self.path}: {key}", fix=FIX)
         return named
 
-    def missing_error(self, what: str, fix: str = FIX, *, part: str | None = None) -> InputError:
+    def missing_error(self, name: str, fix: str = FIX, *, part: str | None = None) -> InputError:
         """Return the error for a missing part, or a missing tensor in a part, with the names that exist."""
         names = ", ".join(list(self.parts if part is None else self.tensors(part))[:8])
-        found = f"no {what} (keys: {names})" if part is None else f"no {what} in {part} (its tensors: {names})"
-        return InputError(where=str(self.path), found=found, needed=_PARTS, fix=fix)
+        problem = f"no {name} (keys: {names})" if part is None else f"no {name} in {part} (its tensors: {names})"
+        return InputError(where=str(self.path), found=problem, needed=_PARTS, fix=fix)
 
 
 def to_official_name(name: str, part: Part) -> tuple[str, int | None]:
@@ -518,33 +531,35 @@ def to_official_name(name: str, part: Part) -> tuple[str, int | None]:
 def load_weights(
     network: nn.Module, weights: Mapping[str, Tensor], rename: Rename, dtype: torch.dtype, *, where: str, fix: str
 ) -> None:
-    """Load memory-mapped weights into a network on the meta device, cast each as it is read, and freeze them.
+    """Load memory-mapped weights into a network on the meta device, cast each when it is read, and freeze them.
 
     Raises:
         InputError: A tensor is missing, unknown or of another shape, or a weight is not finite.
     """
-    own = network.state_dict()
-    names = {ours: rename(ours) for ours in own}
-    needed = {
-        theirs: own[ours].shape if third is None else (3 * len(own[ours]), *own[ours].shape[1:])
-        for ours, (theirs, third) in names.items()
+    state = network.state_dict()
+    names = {our_name: rename(our_name) for our_name in state}
+    expected_shapes = {
+        file_name: state[our_name].shape if third is None else (3 * len(state[our_name]), *state[our_name].shape[1:])
+        for our_name, (file_name, third) in names.items()
     }
-    check_tensors({name: value.shape for name, value in weights.items()}, needed, where=where, fix=fix)
+    check_tensors({name: value.shape for name, value in weights.items()}, expected_shapes, where=where, fix=fix)
     require_floats(weights, where=where, fix=fix)
-    for ours, (theirs, third) in names.items():
-        value = weights[theirs] if third is None else weights[theirs].chunk(3)[third]
-        own[ours] = value.to(dtype, copy=True)
-    require_finite(own, where=where, fix=fix)
-    network.load_state_dict(own, assign=True)
+    for our_name, (file_name, third) in names.items():
+        value = weights[file_name] if third is None else weights[file_name].chunk(3)[third]
+        state[our_name] = value.to(dtype, copy=True)
+    require_finite(state, where=where, fix=fix)
+    network.load_state_dict(state, assign=True)
     network.requires_grad_(False)
 
 
 def to_official_names(weights: Mapping[str, Tensor], part: Part) -> dict[str, Tensor]:
     """Return our weights with Meta's names, and q, k and v fused."""
-    pieces: dict[str, list[Tensor]] = {}
-    for name, value in weights.items():  # q, k and v in this order, as everywhere
-        pieces.setdefault(to_official_name(name, part)[0], []).append(value.detach())
-    return {f"module.{name}": own[0] if len(own) == 1 else torch.cat(own) for name, own in pieces.items()}
+    parts_by_name: dict[str, list[Tensor]] = {}
+    for name, value in weights.items():  # q, k and v of a layer are in this order in every state_dict of ours
+        parts_by_name.setdefault(to_official_name(name, part)[0], []).append(value.detach())
+    return {
+        f"module.{name}": parts[0] if len(parts) == 1 else torch.cat(parts) for name, parts in parts_by_name.items()
+    }
 
 
 def count_blocks(names: Mapping[str, object], blocks: str) -> int:
@@ -559,20 +574,20 @@ def count_blocks(names: Mapping[str, object], blocks: str) -> int:
     return 1 + max(numbers)
 
 
-def _problem_of(path: Path, error: Exception) -> tuple[str, str]:
-    """Return a description of a file that torch could not load, with its first bytes, and the fix."""
-    refused = re.search(r"GLOBAL ([\w.]+)", str(error))
-    if refused:
-        found = f"a pickle that would call {refused[1]}, which could execute code; it was not loaded"
+def _describe_unreadable_file(path: Path, error: Exception) -> tuple[str, str]:
+    """Describe a file that torch could not load, with its first bytes; return the description and the fix."""
+    blocked = re.search(r"GLOBAL ([\w.]+)", str(error))
+    if blocked:
+        problem = f"a pickle that would call {blocked[1]}, which could execute code; it was not loaded"
         old, new, keys = map(
             json.dumps, (str(path), str(path.with_suffix(".weights.pt")), [*ENCODER_KEYS, "predictor"])
         )
         code = f'import torch; old = torch.load({old}, map_location="cpu", weights_only=False)'
         code += f"; torch.save({{key: old[key] for key in {keys} if key in old}}, {new})"
-        return found, f"If you trust the file, save its weights alone: `python -c {shlex.quote(code)}`"
+        return problem, f"If you trust the file, save its weights alone: `python -c {shlex.quote(code)}`"
     with path.open("rb") as file:
-        head = file.read(24)
+        first_bytes = file.read(24)
     reason = next(iter(str(error).splitlines()), type(error).__name__)[:120]
     size = path.stat().st_size / 1e9
-    found = f"{size:.2f} GB, beginning with {head!r}, that torch cannot read ({reason}): truncated, or another format"
-    return found, FIX
+    problem = f"{size:.2f} GB, beginning with {first_bytes!r}, that torch cannot read ({reason})"
+    return f"{problem}: truncated, or another format", FIX

@@ -2,11 +2,12 @@
 
 Attention is not compiled here: SDPA is a single kernel, and FlexAttention is compiled separately (`attention`). The
 halves therefore depend neither on the keys of earlier steps, whose number grows with every step, nor on a mask. Weights
-are arguments, so that all blocks with the same kind of layers share one compilation. PyTorch compiles again for another
-number of tokens or clips (then for any number), with and without gradients, and if nothing before a block is trained.
+are arguments, so that all blocks with the same kind of layers share one compilation. PyTorch compiles again if the
+number of tokens or clips changes (the new code then supports any number), if gradients are enabled or disabled, and if
+no layer before a block is trained.
 
-A failed compilation or recompilation is an error. PyTorch would continue without it, which is slow for a block, and
-makes FlexAttention hold all scores in memory.
+A failed compilation or recompilation is an error. PyTorch would continue with uncompiled code, which is slow for a
+block and makes FlexAttention store all attention scores in memory.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ import torch
 from vjepa2_ac.errors import InputError
 
 BACKEND = "inductor"
-MAX_VARIANTS = 64  # that PyTorch may compile of one function: its default is 8
+MAX_VARIANTS = 64  # limit of compiled variants per function; PyTorch's default is 8
 
-When = Literal["never", "with gradients", "always"]  # blocks are compiled
+When = Literal["never", "with gradients", "always"]  # when blocks are compiled
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -48,15 +49,15 @@ def has_triton() -> bool:
     return importlib.util.find_spec("triton") is not None
 
 
-def missing_for_compilation(device: str) -> str | None:
-    """Return what this machine lacks for compilation on a device type (cpu or cuda), or None."""
+def describe_missing_compiler(device: str) -> str | None:
+    """Describe what this machine lacks for compilation on a device type (cpu or cuda); None if nothing is missing."""
     if device == "cuda" and not has_triton():
         return "Triton is not installed"
-    given = os.environ.get("CC" if device == "cuda" else "CXX")
-    usual = ("gcc", "clang") if device == "cuda" else ("g++", "clang++")
-    if any(map(shutil.which, (given,) if given else usual)):
+    configured = os.environ.get("CC" if device == "cuda" else "CXX")
+    compilers = ("gcc", "clang") if device == "cuda" else ("g++", "clang++")
+    if any(map(shutil.which, (configured,) if configured else compilers)):
         return None
-    return f"no compiler is found ({given or ' or '.join(usual)})"
+    return f"no compiler is found ({configured or ' or '.join(compilers)})"
 
 
 def require_compiler(device: str, *, where: str) -> None:
@@ -67,9 +68,9 @@ def require_compiler(device: str, *, where: str) -> None:
         where: The setting that requests compilation.
 
     Raises:
-        InputError: The compiler is not installed; names what is missing.
+        InputError: A compiler or Triton is not installed; the message names it.
     """
-    missing = missing_for_compilation(device)
+    missing = describe_missing_compiler(device)
     if missing:
         hint = " (Triton comes with PyTorch for CUDA)" if device == "cuda" else ""
         raise InputError(where=where, found=f"blocks, but {missing}", fix=f"Set {where}=off, or install it{hint}")
@@ -81,16 +82,18 @@ def _compiled(function: Callable[..., Any], backend: str, override: str, dynamic
     from torch._dynamo.exc import FailOnRecompileLimitHit
 
     config.recompile_limit = max(config.recompile_limit, MAX_VARIANTS)
-    # fullgraph: otherwise the limit is only a warning
-    whole = torch.compile(function, backend=backend, fullgraph=True, dynamic=dynamic)
+    # Without fullgraph=True PyTorch only warns when the limit is reached.
+    compiled = torch.compile(function, backend=backend, fullgraph=True, dynamic=dynamic)
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         try:
-            return whole(*args, **kwargs)
+            return compiled(*args, **kwargs)
         except FailOnRecompileLimitHit as error:
-            found = f"more than {config.recompile_limit} sizes of batches and clips, each of which needs a compilation"
+            problem = (
+                f"more than {config.recompile_limit} sizes of batches and clips, each of which needs a compilation"
+            )
             fix = f"Set {override}, or use fewer sizes"
-            raise InputError(where=override.partition("=")[0], found=found, fix=fix) from error
+            raise InputError(where=override.partition("=")[0], found=problem, fix=fix) from error
 
     return call

@@ -21,7 +21,7 @@ with quiet_imports():
     from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
 
 ENCODE_CHUNK = 16  # frames per forward pass; limits the memory
-TUBELET = 2  # frames per tubelet; both are the same frame here
+TUBELET = 2  # frames per tubelet; the encoder receives each frame twice
 _GRID_OF_POSITIONS = 16  # V-JEPA 2.1 scales the positions of any grid to those of 256 px
 _LEVELS = 4  # levels of V-JEPA 2.1, each with a norm; the norm of the last level is the last norm of the network
 
@@ -32,14 +32,14 @@ class Encoder(nn.Module):
     The network is the encoder of transformers' `VJEPA2Model`, without its masked predictor. Rotary tables are computed
     once and in float32 (transformers computes angles in the data type of the weights), and patches are embedded by one
     matrix product. V-JEPA 2.1 has other rotary positions, and adds a learned vector for the kind of input (video or
-    image) to every patch. Its weights without influence on the output (norms of lower levels, the patch embedding of
-    the other kind) are kept, so that a checkpoint can be written again.
+    image) to every patch. Weights without influence on the output (norms of lower levels, the patch embedding of the
+    other kind) are loaded too, so that a checkpoint can be written again.
     """
 
     def __init__(self, sizes: ModelSizes) -> None:
         super().__init__()
         self.image_size = sizes.image_size
-        self.vit = VJEPA2Encoder(_config(sizes))
+        self.vit = VJEPA2Encoder(_build_config(sizes))
         width, grid = sizes.encoder.width, sizes.image_size // sizes.patch_size
         if sizes.encoder.family == "v2":
             patches, layout = _FramePatches(width, sizes.patch_size), TokenLayout(1, grid)
@@ -53,7 +53,7 @@ class Encoder(nn.Module):
                 "this version of transformers rotates queries and keys elsewhere; 5.17 to 5.23 are tested"
             )
         for block in self.vit.layer:
-            block.attention = _ExactAttention(self.vit.config, layout)  # its weights have the same names
+            block.attention = _ExactAttention(self.vit.config, layout)  # the names of the weights do not change
         self.vit.layernorm = _PreciseNorm(width, eps=NORM_EPSILON)
         self.requires_grad_(False)
         self.eval()
@@ -69,7 +69,7 @@ class Encoder(nn.Module):
             chunk: Number of frames per forward pass; limits the memory.
 
         Raises:
-            ValueError: The frames have another size than the model's, for which the positions would be wrong.
+            ValueError: The frames have another size than those of the model, so that the positions would be wrong.
         """
         if frames.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(
@@ -83,12 +83,12 @@ class Encoder(nn.Module):
                 features.append(self.vit(tubelets).last_hidden_state)
         return torch.cat(features)
 
-    def train(self, mode: bool = True) -> Encoder:  # noqa: ARG002  # a frozen encoder has one mode
+    def train(self, mode: bool = True) -> Encoder:  # noqa: ARG002  # the signature of nn.Module
         """Keep eval mode, independently of the surrounding model."""
         return super().train(False)
 
     def reset_last_norm(self) -> None:
-        """Reset the weights of the last norm, because the loaded ones belong to a later layer that was removed."""
+        """Reset the weights of the last norm, because the loaded weights belong to a later layer that was removed."""
         nn.init.ones_(self.vit.layernorm.weight)
         nn.init.zeros_(self.vit.layernorm.bias)
 
@@ -110,8 +110,8 @@ class Encoder(nn.Module):
 class _FramePatches(nn.Conv3d):
     """The patch embedding of tubelets of two identical frames, as a matrix product with the kernel summed over time.
 
-    It needs half the arithmetic of the convolution, and does not depend on cuDNN, of which some versions have no fast
-    3D convolution in bfloat16.
+    The product needs half the arithmetic of the convolution. It does not depend on cuDNN, some versions of which have
+    no fast 3D convolution in bfloat16.
     """
 
     def __init__(self, width: int, patch_size: int) -> None:
@@ -122,9 +122,9 @@ class _FramePatches(nn.Conv3d):
         self, tubelets: Float[Tensor, "frames 3 time height width"]
     ) -> Float[Tensor, "frames dim 1 rows columns"]:
         """Return the result of the convolution for tubelets of identical frames."""
-        return self._embedded(tubelets[:, :, 0], self)
+        return self._embed(tubelets[:, :, 0], self)
 
-    def _embedded(
+    def _embed(
         self, frames: Float[Tensor, "frames 3 height width"], layer: nn.Conv3d
     ) -> Float[Tensor, "frames dim 1 rows columns"]:
         side = self.kernel_size[-1]
@@ -154,7 +154,7 @@ class _PatchesByKind(_FramePatches):
         """Return the patches of frames: as tubelets of identical frames, or as images."""
         if self.frame == "tubelet":
             return super().forward(tubelets) + self.video_kind.reshape(1, -1, 1, 1, 1)
-        return self._embedded(tubelets[:, :, 0], self.of_images) + self.image_kind.reshape(1, -1, 1, 1, 1)
+        return self._embed(tubelets[:, :, 0], self.of_images) + self.image_kind.reshape(1, -1, 1, 1, 1)
 
 
 class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformers has no types
@@ -164,10 +164,10 @@ class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformer
         super().__init__(config, config.hidden_size, config.num_attention_heads)
         self.layout = layout
 
-    def get_position_ids(self, x: Tensor, masks: Any = None) -> None:  # transformers' names
-        """Skip the computation of positions, ten kernels per layer: the tables contain those of the layout."""
+    def get_position_ids(self, x: Tensor, masks: Any = None) -> None:  # the signature of transformers
+        """Skip the computation of positions (ten kernels per layer), because the tables contain them."""
 
-    def apply_rotary_embeddings(self, qk: Tensor, pos_ids: Any) -> Tensor:  # noqa: ARG002  # positions are the layout's
+    def apply_rotary_embeddings(self, qk: Tensor, pos_ids: Any) -> Tensor:  # noqa: ARG002  # the tables contain the positions
         """Return queries or keys [batch heads sequence head_dim], rotated by their position."""
         tables = rotary_tables(self.layout, qk.shape[-1], qk.device)
         return rotate(qk.transpose(1, 2), tables).transpose(1, 2)
@@ -180,7 +180,7 @@ class _PreciseNorm(nn.LayerNorm):
         return layer_norm(tokens.float(), self.normalized_shape, self.weight.float(), self.bias.float(), self.eps)
 
 
-def _config(sizes: ModelSizes) -> Any:
+def _build_config(sizes: ModelSizes) -> Any:
     config = VJEPA2Config(
         patch_size=sizes.patch_size,
         crop_size=sizes.image_size,

@@ -32,11 +32,11 @@ with quiet_imports():
 _SETS = {"attention": ("q", "k", "v", "o"), "mlp": ("fc1", "fc2")}
 NEEDED = "a LoRA adapter of V-JEPA 2-AC's predictor in PEFT's format, as written by vjepa2-ac"
 FIX = "Copy or train the adapter again; other methods of PEFT are not supported"
-_INFORMATIONAL = frozenset({  # origin and purpose
+_INFORMATIONAL = frozenset({  # options without effect on the adapter
     "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_type", "peft_version",
     "revision", "task_type",
 })  # fmt: skip
-_LITERAL = re.compile(r"[\w.]+")  # names of layers; as regular expressions they are fast to match
+_LITERAL = re.compile(r"[\w.]+")  # a plain layer name, which is fast to match as a regular expression
 _MOST_RANK, _MOST_ALPHA = 1024, 1e6
 
 
@@ -83,7 +83,7 @@ class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no typ
 
 
 class TrainableReport(NamedTuple):
-    """Parameter counts; those of an adapter count as trained only."""
+    """Parameter counts; the parameters of an adapter are counted in `trained` only."""
 
     trained: int
     predictor: int
@@ -120,11 +120,10 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
             tuple(dict.fromkeys(name.split(".")[0] for name in model.new_input_heads.replaced)), config
         )
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)  # of initialisations that are drawn by PEFT
+        torch.manual_seed(seed)  # for initialisations that PEFT draws
         wrap_predictor(model, config, start=config.peft.get("init_lora_weights", True))
-    parse_adapter_config(
-        lora_config(model).to_dict(), where="adapter.peft"
-    )  # check that the saved adapter can be loaded
+    # Check that the adapter can be loaded after it is saved.
+    parse_adapter_config(lora_config(model).to_dict(), where="adapter.peft")
     layers = lora_layers(model)
     if config.peft.get("init_lora_weights", True) is True:
         _draw_first_matrices(layers, torch.Generator().manual_seed(seed))
@@ -132,10 +131,10 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
 
 
 def with_adapter(predictor: ActionConditionedPredictor, config: AdapterConfig, start: bool | str = True) -> nn.Module:
-    """Return a predictor with a LoRA adapter, as `add_adapter` makes it.
+    """Return a predictor with a LoRA adapter, whose matrices are initialised by PEFT.
 
     Args:
-        predictor: The predictor, not adapted.
+        predictor: The predictor, without an adapter.
         config: The config of the adapter.
         start: PEFT's `init_lora_weights`.
 
@@ -154,17 +153,17 @@ def with_adapter(predictor: ActionConditionedPredictor, config: AdapterConfig, s
         raise InputError(where="adapter.peft", found=str(error), needed=needed) from None
     wrapped.train(predictor.training)  # PEFT creates dropout in training mode
     for name, value in wrapped.named_parameters():
-        if _is_trained(name):
+        if _is_trained_name(name):
             value.data = value.data.float()
     return wrapped  # type: ignore[no-any-return]  # PEFT has no types
 
 
 def trainable_report(model: WorldModel) -> TrainableReport:
-    """Count the trained parameters (even if frozen now), those of the predictor without adapter, and all parameters."""
-    trained = 0 if model.adaptation is None else sum(value.numel() for value in _added(model))
-    own = sum(value.numel() for value in base_weights(model.base_predictor).values())
+    """Count the trained parameters (even if currently frozen), those of the predictor without adapter, and all."""
+    trained = 0 if model.adaptation is None else sum(value.numel() for value in _iterate_trained_weights(model))
+    predictor = sum(value.numel() for value in base_weights(model.base_predictor).values())
     encoder = sum(value.numel() for value in model.encoder.parameters())
-    return TrainableReport(trained, own, own + encoder)
+    return TrainableReport(trained, predictor, predictor + encoder)
 
 
 def lora_layers(model: WorldModel) -> dict[str, Any]:
@@ -184,7 +183,7 @@ def require_adaptation(model: WorldModel) -> Adaptation:
 
 
 def train_all_weights(model: WorldModel) -> None:
-    """Train every weight of the predictor that has an input."""
+    """Make every weight of the predictor trainable, except in layers without an input."""
     start = {name: value.detach().to("cpu", copy=True) for name, value in model.predictor.state_dict().items()}
     model.adaptation = Adaptation("none", model.predictor_fingerprint(), model.encoder_fingerprint(), start)
     model.predictor.float()
@@ -195,9 +194,8 @@ def wrap_predictor(model: WorldModel, config: AdapterConfig, start: bool | str =
     """Add a LoRA adapter to the predictor of a model; raises the errors of `with_adapter`."""
     base = model.predictor_fingerprint()
     checkpointing = model.base_predictor.gradient_checkpointing
-    model.set_gradient_checkpointing(
-        False
-    )  # otherwise PEFT adds an input hook, which only re-entrant checkpointing needs
+    # With gradient checkpointing PEFT would add an input hook, which only re-entrant checkpointing needs.
+    model.set_gradient_checkpointing(False)
     model.predictor = with_adapter(model.base_predictor, config, start)
     model.set_gradient_checkpointing(checkpointing)
     model.adaptation = Adaptation("lora", base, model.encoder_fingerprint())
@@ -206,14 +204,14 @@ def wrap_predictor(model: WorldModel, config: AdapterConfig, start: bool | str =
 def _draw_first_matrices(layers: Mapping[str, Any], generator: torch.Generator) -> None:
     """Draw the first matrix of each layer as PEFT does, but from a generator; the second one is zero."""
     for layer in layers.values():
-        first = layer.lora_A["default"].weight
-        fresh = torch.empty(first.shape)
-        nn.init.kaiming_uniform_(fresh, a=math.sqrt(5), generator=generator)
-        first.data.copy_(fresh)
+        matrix = layer.lora_A["default"].weight
+        values = torch.empty(matrix.shape)
+        nn.init.kaiming_uniform_(values, a=math.sqrt(5), generator=generator)
+        matrix.data.copy_(values)
 
 
 def _measure_magnitudes(layers: Mapping[str, Any]) -> None:
-    """Set DoRA's magnitudes to the current norms of the rows, in float32, as PEFT computes them in each step."""
+    """Set DoRA's magnitudes to the current norms of the rows, computed in float32 as PEFT does in each step."""
     for layer in layers.values():
         if "default" in layer.lora_magnitude_vector:
             update = layer.lora_B["default"].weight @ layer.lora_A["default"].weight
@@ -221,7 +219,7 @@ def _measure_magnitudes(layers: Mapping[str, Any]) -> None:
             layer.lora_magnitude_vector["default"].weight.data.copy_(torch.linalg.norm(weight.detach(), dim=1))
 
 
-def _is_trained(name: str) -> bool:
+def _is_trained_name(name: str) -> bool:
     return ".lora_" in name or ".modules_to_save." in name
 
 
@@ -233,25 +231,27 @@ def lora_weights(model: WorldModel) -> dict[str, Tensor]:
 def lora_config(model: WorldModel) -> Any:
     """Return PEFT's config for saving, with names of layers instead of regular expressions from the user."""
     predictor: Any = model.predictor
-    own, layers = predictor.peft_config["default"], lora_layers(model)
+    options, layers = predictor.peft_config["default"], lora_layers(model)
     names = [name.removesuffix(".weight") for name in base_weights(model.base_predictor) if name.endswith(".weight")]
-    bare = {name.rpartition(".")[2] for name in names if name not in layers}
-    last = {name: name.rpartition(".")[2] for name in layers}
+    kinds_without_adapter = {name.rpartition(".")[2] for name in names if name not in layers}
+    kind_by_name = {name: name.rpartition(".")[2] for name in layers}
     resolved = {
         "inference_mode": True,
         "init_lora_weights": True,
-        "target_modules": sorted({name if kind in bare else kind for name, kind in last.items()}),
+        "target_modules": sorted(
+            {name if kind in kinds_without_adapter else kind for name, kind in kind_by_name.items()}
+        ),
         "exclude_modules": None,
         "layers_to_transform": None,
         "layers_pattern": None,
-        "rank_pattern": {name: layer.r["default"] for name, layer in layers.items() if layer.r["default"] != own.r},
+        "rank_pattern": {name: layer.r["default"] for name, layer in layers.items() if layer.r["default"] != options.r},
         "alpha_pattern": {
             name: layer.lora_alpha["default"]
             for name, layer in layers.items()
-            if layer.lora_alpha["default"] != own.lora_alpha
+            if layer.lora_alpha["default"] != options.lora_alpha
         },
     }
-    config = LoraConfig(**(own.to_dict() | resolved))
+    config = LoraConfig(**(options.to_dict() | resolved))
     config.target_modules = resolved["target_modules"]  # a list, in this order
     return config
 
@@ -259,15 +259,15 @@ def lora_config(model: WorldModel) -> Any:
 def set_trainable(model: WorldModel, trainable: bool) -> None:
     """Unfreeze or freeze the trained weights."""
     model.predictor.requires_grad_(False)
-    for value in _added(model):
+    for value in _iterate_trained_weights(model):
         value.requires_grad_(trainable)
 
 
-def _added(model: WorldModel) -> Iterator[nn.Parameter]:
+def _iterate_trained_weights(model: WorldModel) -> Iterator[nn.Parameter]:
     """Yield the trained weights: an adapter and whole layers, or all weights of the predictor that have an input."""
     lora = isinstance(model.predictor, PeftModel)
     for name, value in model.predictor.named_parameters():
-        if _is_trained(name) if lora else name.split(".", 1)[0] not in model.base_predictor.unused_layers:
+        if _is_trained_name(name) if lora else name.split(".", 1)[0] not in model.base_predictor.unused_layers:
             yield value
 
 
@@ -279,34 +279,35 @@ def parse_adapter_config(values: Mapping[str, Any], *, where: str) -> AdapterCon
     1,024.
 
     Raises:
-        InputError: It is another kind of adapter, or has an option that is not supported.
+        InputError: The values describe another kind of adapter, or contain an option that is not supported.
     """
     defaults: dict[str, Any] = LoraConfig().to_dict()
-    given: dict[str, Any] = {"kind": "lora", "rslora": False}  # PEFT's default
-    given |= {ours: values[peft] for peft, ours in PEFT_NAMES.items() if values.get(peft) is not None}
+    fields: dict[str, Any] = {"kind": "lora", "rslora": False}  # PEFT's default
+    fields |= {ours: values[peft] for peft, ours in PEFT_NAMES.items() if values.get(peft) is not None}
     options = {name: value for name, value in values.items() if name not in _INFORMATIONAL and name not in PEFT_NAMES}
     options = {name: value for name, value in options.items() if not _is_off(value, defaults.get(name))}
-    unread = {name: value for name, value in options.items() if not _can_be_read(name, value, defaults.get(name))}
+    unsupported = {name: value for name, value in options.items() if not _is_supported(name, value, defaults.get(name))}
     if values.get("peft_type") != "LORA":
-        unread = {"peft_type": values.get("peft_type")}
-    unread |= {peft: None for peft in ("r", "lora_alpha", "target_modules") if values.get(peft) is None}
-    if unread:
-        listed = ", ".join(f"{short_repr(name)} {short_repr(value)}" for name, value in unread.items())
-        found = f"an adapter with unsupported options: {listed}"
-        raise InputError(where=where, found=found, needed=NEEDED, fix=FIX)
-    return parse_record(AdapterConfig, {**given, "peft": options}, where=where, needed=NEEDED, fix=FIX)
+        unsupported = {"peft_type": values.get("peft_type")}
+    unsupported |= {peft: None for peft in ("r", "lora_alpha", "target_modules") if values.get(peft) is None}
+    if unsupported:
+        listed = ", ".join(f"{short_repr(name)} {short_repr(value)}" for name, value in unsupported.items())
+        problem = f"an adapter with unsupported options: {listed}"
+        raise InputError(where=where, found=problem, needed=NEEDED, fix=FIX)
+    return parse_record(AdapterConfig, {**fields, "peft": options}, where=where, needed=NEEDED, fix=FIX)
 
 
 def _is_off(value: object, default: object) -> bool:
     return value is None or value is False or value in ([], {}) or value == default
 
 
-def _can_be_read(name: str, value: object, default: object) -> bool:
-    """Return whether an option is supported: a pattern of whole names, an initialisation, or a number."""
+def _is_supported(name: str, value: object, default: object) -> bool:
+    """Return whether an option is supported: a pattern of plain layer names, an initialisation, or a number."""
     if name in {"rank_pattern", "alpha_pattern"}:
-        kinds, most = ((int,), _MOST_RANK) if name == "rank_pattern" else ((int, float), _MOST_ALPHA)
+        types, limit = ((int,), _MOST_RANK) if name == "rank_pattern" else ((int, float), _MOST_ALPHA)
         return isinstance(value, dict) and all(
-            _LITERAL.fullmatch(key) and type(one) in kinds and 0 < one <= most for key, one in value.items()
+            _LITERAL.fullmatch(layer) and type(number) in types and 0 < number <= limit
+            for layer, number in value.items()
         )
     return name == "init_lora_weights" or (isinstance(value, bool | int | float) and type(value) is type(default))
 
@@ -319,27 +320,27 @@ def _peft_arguments(predictor: ActionConditionedPredictor, config: AdapterConfig
     Raises:
         InputError: An entry of `targets` or `modules_to_save` matches no layer, or a layer is in both.
     """
-    whole = config.modules_to_save
-    if missing := [name for name in whole if not hasattr(predictor, name)]:
-        found = f"{', '.join(missing)}, which a predictor without states does not have"
-        raise InputError(where="adapter.modules_to_save", found=found, fix="Remove it")
+    directly_trained = config.modules_to_save
+    if missing := [name for name in directly_trained if not hasattr(predictor, name)]:
+        problem = f"{', '.join(missing)}, which a predictor without states does not have"
+        raise InputError(where="adapter.modules_to_save", found=problem, fix="Remove it")
     layers = {name for name, layer in predictor.named_modules() if isinstance(layer, nn.Linear)}
     layers -= set(predictor.unused_layers)
     kinds = {name.rpartition(".")[2] for name in layers}
-    sets = {**_SETS, "all": tuple(sorted(kinds - set(whole)))}
+    sets = {**_SETS, "all": tuple(sorted(kinds - set(directly_trained)))}
     targets = list(dict.fromkeys(layer for target in config.targets for layer in sets.get(target, (target,))))
     unknown = [target for target in targets if target not in kinds | layers]
     if unknown or not targets:
-        found = ", ".join(unknown) + " matches no layer of the predictor" if unknown else "no target"
+        problem = ", ".join(unknown) + " matches no layer of the predictor" if unknown else "no target"
         needed = f"some of {', '.join(sorted(kinds))}; or {', '.join(sets)}"
-        raise InputError(where="adapter.targets", found=found, needed=needed)
-    if twice := sorted(set(targets) & set(whole)):
-        found = (
-            f"{', '.join(twice)}, which adapter.targets contains, too: a layer is trained directly or with an adapter"
+        raise InputError(where="adapter.targets", found=problem, needed=needed)
+    if in_both := sorted(set(targets) & set(directly_trained)):
+        problem = (
+            f"{', '.join(in_both)}, which adapter.targets contains, too: a layer is trained directly or with an adapter"
         )
-        raise InputError(where="adapter.modules_to_save", found=found)
+        raise InputError(where="adapter.modules_to_save", found=problem)
     arguments = {peft: getattr(config, ours) for peft, ours in PEFT_NAMES.items()}
-    return arguments | {"target_modules": targets, "modules_to_save": list(whole) or None} | config.peft
+    return arguments | {"target_modules": targets, "modules_to_save": list(directly_trained) or None} | config.peft
 
 
 # ---- disable or merge an adapter ----
@@ -347,9 +348,10 @@ def _peft_arguments(predictor: ActionConditionedPredictor, config: AdapterConfig
 
 @contextmanager
 def use_base_weights(model: WorldModel) -> Iterator[None]:
-    """Make the model predict as its base model within the block.
+    """Make the model predict with the weights of its base model within the `with` block.
 
-    New input layers (`fit_heads`) get their initial values, with which the model is no base model for comparison.
+    New input layers (`fit_heads`) get their untrained initial values. Such a model must not serve as the base model in
+    a comparison.
     """
     if model.adaptation is None:
         yield
@@ -358,7 +360,7 @@ def use_base_weights(model: WorldModel) -> Iterator[None]:
     predictor: Any = model.predictor
     start = model.adaptation.start
     try:
-        with predictor.disable_adapter() if start is None else _weights(predictor, start):
+        with predictor.disable_adapter() if start is None else _use_weights(predictor, start):
             yield
     finally:
         for value, requires_grad in trained:  # PEFT enables gradients when it enables an adapter
@@ -366,7 +368,7 @@ def use_base_weights(model: WorldModel) -> Iterator[None]:
 
 
 def merge_adapter(model: WorldModel) -> None:
-    """Merge the trained weights into the predictor: added in float32, then cast to the base's type, frozen.
+    """Merge the trained weights into the predictor in float32, cast it to the base's data type, and freeze it.
 
     A surrounding autocast has no effect.
 
@@ -374,10 +376,10 @@ def merge_adapter(model: WorldModel) -> None:
         ValueError: The model is not adapted.
     """
     adaptation = require_adaptation(model)
-    never_trained = model.base_predictor.predictor_norm.weight  # beside an adapter
-    dtype = (adaptation.start or {}).get("predictor_norm.weight", never_trained).dtype
+    norm_weight = model.base_predictor.predictor_norm.weight  # not trained by adapters: has the base's data type
+    dtype = (adaptation.start or {}).get("predictor_norm.weight", norm_weight).dtype
     if adaptation.kind == "lora":
-        with torch.autocast(model.device.type, enabled=False):  # or its type would be computed in
+        with torch.autocast(model.device.type, enabled=False):  # otherwise the merge would have autocast's data type
             model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
     model.predictor.to(dtype).requires_grad_(False)
     model.adaptation = model.new_input_heads = None
@@ -388,20 +390,20 @@ def copy_with_merged_adapter(model: WorldModel) -> WorldModel:
 
     The original model is not changed.
     """
-    own = WorldModel.empty(model.sizes)
-    own.encoder, own.predictor = model.encoder, copy.deepcopy(model.predictor)
-    own.adaptation, own.new_input_heads = model.adaptation, model.new_input_heads
-    own.encoder_origin = model.encoder_origin  # part of the encoder's fingerprint
-    if own.adaptation is not None:
-        merge_adapter(own)
-    return own.eval()
+    merged = WorldModel.empty(model.sizes)
+    merged.encoder, merged.predictor = model.encoder, copy.deepcopy(model.predictor)
+    merged.adaptation, merged.new_input_heads = model.adaptation, model.new_input_heads
+    merged.encoder_origin = model.encoder_origin  # part of the encoder's fingerprint
+    if merged.adaptation is not None:
+        merge_adapter(merged)
+    return merged.eval()
 
 
 @contextmanager
-def _weights(predictor: Any, weights: Mapping[str, Tensor]) -> Iterator[None]:
-    now = {name: value.detach().clone() for name, value in predictor.state_dict().items()}
+def _use_weights(predictor: Any, weights: Mapping[str, Tensor]) -> Iterator[None]:
+    current = {name: value.detach().clone() for name, value in predictor.state_dict().items()}
     predictor.load_state_dict(weights)
     try:
         yield
     finally:
-        predictor.load_state_dict(now)
+        predictor.load_state_dict(current)

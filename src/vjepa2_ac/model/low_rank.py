@@ -15,9 +15,8 @@ from torch.nn.functional import linear
 class LowRankLayer:
     """A layer with a low-rank update whose two matrices can be cast for all micro-steps at once (`CastMatrices`)."""
 
-    cast: tuple[Tensor, Tensor] | None = (
-        None  # copies in the data type of the arithmetic, during `CastMatrices.current`
-    )
+    # Copies of the matrices in the data type of the arithmetic, within `CastMatrices.use`.
+    cast: tuple[Tensor, Tensor] | None = None
 
     def matrices(self) -> tuple[Tensor, ...]:
         """Return the two matrices; empty if PEFT computes this layer."""
@@ -45,15 +44,15 @@ def low_rank_linear(
     if update.cast is not None and update.cast[0].dtype == dtype:
         cast = update.cast
     else:
-        cast = tuple(None if one.dtype == dtype else one.detach().to(dtype) for one in matrices)
-    weight, bias = (None if own is None else own.to(dtype) for own in (layer.weight, layer.bias))
+        cast = tuple(None if matrix.dtype == dtype else matrix.detach().to(dtype) for matrix in matrices)
+    weight, bias = (None if value is None else value.to(dtype) for value in (layer.weight, layer.bias))
     masked = None if dropout is None else dropout(tokens)
     apply: Callable[..., Tensor] = _LowRankLinear.apply
     return apply(tokens, masked, weight, bias, *matrices, *cast, scale)
 
 
 class CastMatrices:
-    """The matrices of adapters in the data type of the arithmetic, cast together once per step instead of at each use.
+    """Copies of adapter matrices in the data type of the arithmetic, cast once per step instead of at each use.
 
     Args:
         module: The module with the adapters.
@@ -64,18 +63,22 @@ class CastMatrices:
         self._layers = [
             layer
             for layer in module.modules()
-            if isinstance(layer, LowRankLayer) and [one.dtype != dtype for one in layer.matrices()] == [True, True]
+            if isinstance(layer, LowRankLayer)
+            and [matrix.dtype != dtype for matrix in layer.matrices()] == [True, True]
         ]
-        self._own = [one for layer in self._layers for one in layer.matrices()]
-        self._cast = [torch.empty_like(one, dtype=dtype, requires_grad=False) for one in self._own]
+        self._matrices = [matrix for layer in self._layers for matrix in layer.matrices()]
+        self._copies = [torch.empty_like(matrix, dtype=dtype, requires_grad=False) for matrix in self._matrices]
 
     @contextmanager
-    def current(self) -> Iterator[None]:
-        """Cast now, and make all layers use the copies within the block, in which the matrices must not change."""
-        if self._own:
+    def use(self) -> Iterator[None]:
+        """Cast the matrices, and make all layers use the copies within the `with` block.
+
+        The matrices must not change within the block.
+        """
+        if self._matrices:
             with torch.no_grad():
-                torch._foreach_copy_(self._cast, self._own)
-        for layer, first, second in zip(self._layers, self._cast[::2], self._cast[1::2], strict=True):
+                torch._foreach_copy_(self._copies, self._matrices)
+        for layer, first, second in zip(self._layers, self._copies[::2], self._copies[1::2], strict=True):
             layer.cast = (first, second)
         try:
             yield
@@ -105,37 +108,40 @@ class _LowRankLinear(torch.autograd.Function):
         second_cast: Tensor | None,
         scale: float,
     ) -> Tensor:
-        ctx.own_dtype = first.dtype
+        ctx.matrix_dtype = first.dtype
         first, second = first if first_cast is None else first_cast, second if second_cast is None else second_cast
-        read = (tokens if masked is None else masked).flatten(0, -2)
-        inner = linear(read, first)
+        adapter_input = (tokens if masked is None else masked).flatten(0, -2)
+        inner = linear(adapter_input, first)
         result = linear(tokens, weight, bias)
-        result = _plus_product(result.flatten(0, -2), inner, second.T, scale).view_as(result)
+        result = _add_product(result.flatten(0, -2), inner, second.T, scale).view_as(result)
         needed = (ctx.needs_input_grad[4], ctx.needs_input_grad[5], ctx.needs_input_grad[0])
-        kept = (value if is_needed else None for value, is_needed in zip((read, inner, weight), needed, strict=True))
-        ctx.save_for_backward(*kept, first, second)
+        values = zip((adapter_input, inner, weight), needed, strict=True)
+        saved = (value if is_needed else None for value, is_needed in values)
+        ctx.save_for_backward(*saved, first, second)
         ctx.scale, ctx.is_masked = scale, masked is not None
         return result
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        read, inner, weight, first, second = ctx.saved_tensors
+        adapter_input, inner, weight, first, second = ctx.saved_tensors
         rows, shape = gradient.flatten(0, -2), (*gradient.shape[:-1], first.shape[1])
-        to_inner = rows @ second
-        of_tokens = of_masked = None
+        inner_gradient = rows @ second
+        tokens_gradient = masked_gradient = None
         if ctx.needs_input_grad[0]:
-            of_tokens = rows @ weight
+            tokens_gradient = rows @ weight
             if not ctx.is_masked:
-                of_tokens = _plus_product(of_tokens, to_inner, first, ctx.scale)
-            of_tokens = of_tokens.view(shape)
+                tokens_gradient = _add_product(tokens_gradient, inner_gradient, first, ctx.scale)
+            tokens_gradient = tokens_gradient.view(shape)
         if ctx.needs_input_grad[1]:
-            of_masked = (to_inner * ctx.scale @ first).view(shape)
-        of_first = None if read is None else (to_inner.T @ read * ctx.scale).to(ctx.own_dtype)
-        of_second = None if inner is None else (rows.T @ inner * ctx.scale).to(ctx.own_dtype)
-        return of_tokens, of_masked, None, None, of_first, of_second, None, None, None
+            masked_gradient = (inner_gradient * ctx.scale @ first).view(shape)
+        first_gradient = (
+            None if adapter_input is None else (inner_gradient.T @ adapter_input * ctx.scale).to(ctx.matrix_dtype)
+        )
+        second_gradient = None if inner is None else (rows.T @ inner * ctx.scale).to(ctx.matrix_dtype)
+        return tokens_gradient, masked_gradient, None, None, first_gradient, second_gradient, None, None, None
 
 
-def _plus_product(total: Tensor, left: Tensor, right: Tensor, scale: float) -> Tensor:
+def _add_product(total: Tensor, left: Tensor, right: Tensor, scale: float) -> Tensor:
     """Return `total + scale * left @ right`, computed in place unless a compiler traces the function."""
     if torch.compiler.is_compiling():  # torch 2.11 would lose the gradient of the result (PyTorch issue 180642)
         return torch.addmm(total, left, right, alpha=scale)

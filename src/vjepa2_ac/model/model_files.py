@@ -113,19 +113,19 @@ def read_sizes(folder: Path) -> ModelSizes:
     return parse_record(ModelSizes, card.get("sizes"), where=f"{where}: sizes", needed=NEEDED_MODEL, fix=_FIX)
 
 
-def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
-    """Refuse configured sizes that differ from those of the model.
+def check_sizes(model_sizes: ModelSizes, config_sizes: ModelSizes, *, where: str) -> None:
+    """Check that no configured size differs from the size in the model.
 
-    Sizes that equal the default are not compared, because the config of a run contains all defaults.
+    Configured sizes that equal the default are not compared, because the config of a run contains all defaults.
 
     Raises:
-        InputError: A size differs; names it.
+        InputError: A size differs; the message names it.
     """
-    actual, configured, default = (flatten(sizes.model_dump()) for sizes in (found, given, ModelSizes()))
+    actual, configured, default = (flatten(sizes.model_dump()) for sizes in (model_sizes, config_sizes, ModelSizes()))
     wrong = [key for key in flatten(SizesConfig().model_dump()) if configured[key] not in (actual[key], default[key])]
     if wrong:
-        said = ", ".join(f"{key} {actual[key]}, and model.sizes has {configured[key]}" for key in wrong)
-        raise InputError(where=where, found=said, fix="Remove them from model.sizes: they are read from the model")
+        problem = ", ".join(f"{key} {actual[key]}, and model.sizes has {configured[key]}" for key in wrong)
+        raise InputError(where=where, found=problem, fix="Remove them from model.sizes: they are read from the model")
 
 
 def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
@@ -147,7 +147,7 @@ def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
 class EncoderShape:
     """A published encoder."""
 
-    name: str  # ViT-B, ...
+    name: str  # such as ViT-B
     width: int
     depth: int
     heads: int
@@ -160,8 +160,8 @@ class EncoderShape:
 
     def sizes(self, family: Family, frame: FramePath) -> EncoderSizes:
         """Return the sizes of an encoder of this shape."""
-        own = {"width": self.width, "depth": self.depth, "heads": self.heads, "mlp_ratio": self.hidden / self.width}
-        return EncoderSizes.model_validate({**own, "family": family, "frame": frame})
+        shape = {"width": self.width, "depth": self.depth, "heads": self.heads, "mlp_ratio": self.hidden / self.width}
+        return EncoderSizes.model_validate({**shape, "family": family, "frame": frame})
 
 
 VIT_B = EncoderShape("ViT-B", 768, 12, 12, 3072)
@@ -170,7 +170,7 @@ VIT_H = EncoderShape("ViT-H", 1280, 32, 16, 5120)
 VIT_g = EncoderShape("ViT-g", 1408, 40, 22, 6144)
 VIT_G = EncoderShape("ViT-G", 1664, 48, 26, 8192)
 
-PUBLISHED_HEADS: Mapping[int, int] = {one.width: one.heads for one in (VIT_B, VIT_L, VIT_H, VIT_g, VIT_G)}
+PUBLISHED_HEADS: Mapping[int, int] = {shape.width: shape.heads for shape in (VIT_B, VIT_L, VIT_H, VIT_g, VIT_G)}
 """Width of an encoder -> number of attention heads, which tensors do not determine."""
 
 
@@ -196,24 +196,26 @@ class EncoderOrigin:
 
 # ---- published checkpoints ----
 
-OFFICIAL = "vjepa2-ac-vitg"  # Meta's world model, which `download` fetches without a name
+OFFICIAL = "vjepa2-ac-vitg"  # Meta's world model, which `vjepa2-ac download` fetches by default
 
 _URL = "https://dl.fbaipublicfiles.com/vjepa2/"
-_TOLERANCE = 0.25  # of a size that is only estimated
+_TOLERANCE = 0.25  # relative tolerance of an approximate file size
 
 
 @dataclass(frozen=True)
 class Published:
     """A file that can be downloaded; Meta publishes no hashes."""
 
-    name: str  # for `vjepa2-ac download`; names differ by more than the case of a letter
-    remote: str  # Meta's name of the file
+    name: str  # argument of `vjepa2-ac download`; unique even if case is ignored
+    remote: str  # file name on Meta's server
     encoder: EncoderShape
-    image_size: int  # at which it was trained last, in pixels
-    key: str  # of the encoder's weights in the file
-    gigabytes: float  # about: encoder, its average, predictor and the optimizer's moments, in float32
-    bytes: int | None = None  # exactly, where known
-    licence: str = "MIT"  # of Meta's repository; Meta's server sends none with the file
+    image_size: int  # frame size in the last phase of training, in pixels
+    key: str  # key of the encoder's weights in the file
+    gigabytes: (
+        float  # approximate file size; the file also contains an average of the weights and the optimizer's moments
+    )
+    bytes: int | None = None  # exact file size; None if it is not known
+    licence: str = "MIT"  # the licence of Meta's repository, because the server sends none with the file
 
     @property
     def model_kind(self) -> str:
@@ -232,7 +234,7 @@ class Published:
 
     @property
     def file(self) -> str:
-        """The local file name, which differs for ViT-g and ViT-G on a case-insensitive disk, too."""
+        """The local file name, which is unique even on a case-insensitive disk."""
         return f"{self.name}.pt"
 
     @property
@@ -261,11 +263,11 @@ PUBLISHED: tuple[Published, ...] = (
 
 def find_published_file(file_name: str) -> Published | None:
     """Return the published file with exactly this name, Meta's or ours; None if there is none."""
-    return next((one for one in PUBLISHED if file_name in {one.remote, one.file}), None)
+    return next((published for published in PUBLISHED if file_name in {published.remote, published.file}), None)
 
 
 def find_published(text: str) -> Published:
-    """Return the published checkpoint that a name means, with or without `.pt`.
+    """Return the published checkpoint with a name, given with or without `.pt`.
 
     Args:
         text: Our name, or Meta's name of the file.
@@ -274,11 +276,11 @@ def find_published(text: str) -> Published:
         InputError: No published checkpoint has this name.
     """
     name = text.removesuffix(".pt")
-    meant = next((one for one in PUBLISHED if name in {one.name, one.remote.removesuffix(".pt")}), None)
-    if meant is None:
+    published = next((known for known in PUBLISHED if name in {known.name, known.remote.removesuffix(".pt")}), None)
+    if published is None:
         fix = "`vjepa2-ac download --list` shows all names; --to sets the path of the file"
         raise InputError(where=f"download {text}", found="no published checkpoint of this name", fix=fix)
-    return meant
+    return published
 
 
 CHUNK_BYTES = 2**20
@@ -290,7 +292,7 @@ def download(
     url: str,
     path: str | Path,
     *,
-    known: Published | None = None,
+    published: Published | None = None,
     reporter: Reporter = SILENT,
     policy: RetryPolicy = _POLICY,
 ) -> Path:
@@ -299,8 +301,8 @@ def download(
     Args:
         url: The URL of the file.
         path: The path of the complete file, which exists only after the download has finished. An existing file is
-            kept if its size fits.
-        known: The published checkpoint, whose size is checked; None for any file.
+            kept if it has the right size.
+        published: The published checkpoint, whose size is checked; None for any file.
         reporter: Receives the progress in megabytes.
         policy: The number of consecutive attempts without a new byte, and the waits between them.
 
@@ -314,14 +316,14 @@ def download(
         if path.is_dir():
             raise InputError(where=str(path), found="a folder", needed="the name of a file", fix="Name a file in it")
         if path.exists():
-            _require_size(known, _size(path), where=str(path))
+            _require_size(published, _size(path), where=str(path))
             return path
         path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{known.name}.part" if known else f"{path.name}.part")
+    part = path.with_name(f"{path.name}.{published.name}.part" if published else f"{path.name}.part")
     try:
         call_with_retries(
             url,
-            lambda timeout_s: _fetch(url, part, known, reporter, timeout_s),
+            lambda timeout_s: _fetch(url, part, published, reporter, timeout_s),
             policy=policy,
             access="Check the URL",
             progress=lambda: _size(part),
@@ -329,57 +331,57 @@ def download(
     except RefusedError:
         raise
     except UnreachableError as error:
-        found = f"{error.found}; {_size(part)} bytes are in {part}"
+        problem = f"{error.found}; {_size(part)} bytes are in {part}"
         fix = "Check the network and start again: the download resumes where it stopped"
-        raise UnreachableError(where=url, found=found, fix=fix) from None
+        raise UnreachableError(where=url, found=problem, fix=fix) from None
     return part.replace(path)
 
 
-def _fetch(url: str, part: Path, known: Published | None, reporter: Reporter, timeout_s: float) -> None:
-    """Download the rest of a file."""
+def _fetch(url: str, part: Path, published: Published | None, reporter: Reporter, timeout_s: float) -> None:
+    """Download the part of a file that is missing in `part`."""
     start = _size(part)
     try:
-        request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user's
-        answer = urllib.request.urlopen(request, timeout=timeout_s)  # noqa: S310  # the user's
+        request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user sets the URL
+        response = urllib.request.urlopen(request, timeout=timeout_s)  # noqa: S310  # the user sets the URL
     except http.client.InvalidURL as error:
         raise ValueError(error) from None  # another attempt cannot succeed
     except urllib.error.HTTPError as error:
         if error.code != 416:
             raise
-        if error.headers.get("Content-Range", "").endswith(f"/{start}"):  # nothing is left
+        if error.headers.get("Content-Range", "").endswith(f"/{start}"):  # the file is complete
             return
         part.unlink()
         raise http.client.HTTPException("the partial download does not match the file; starting again") from None
-    with answer:
-        start = start if answer.headers.get("Content-Range", "").startswith(f"bytes {start}-") else 0
-        promised = answer.headers.get("Content-Length", "")
-        if not promised.isdigit():
+    with response:
+        start = start if response.headers.get("Content-Range", "").startswith(f"bytes {start}-") else 0
+        content_length = response.headers.get("Content-Length", "")
+        if not content_length.isdigit():
             needed = "the size of the file, without which an incomplete download is not detected"
             raise InputError(where=url, found="a response without Content-Length", needed=needed, fix=_PROXY)
-        whole = start + int(promised)
-        _require_size(known, whole, where=url)
+        total = start + int(content_length)
+        _require_size(published, total, where=url)
         free = storage.free_bytes(part.parent.absolute()) + _size(part)
-        if whole > free:
-            needed = f"{whole / 1e9:.4g} GB, of which {start / 1e9:.4g} GB are downloaded"
+        if total > free:
+            needed = f"{total / 1e9:.4g} GB, of which {start / 1e9:.4g} GB are downloaded"
             fix = "Free some space, or name a file on a larger disk with --to"
             raise InputError(where=str(part), found=f"{free / 1e9:.4g} GB free on its disk", needed=needed, fix=fix)
-        show = reporter.task(f"{part.name.removesuffix('.part')} (MB)")
+        report_progress = reporter.task(f"{part.name.removesuffix('.part')} (MB)")
         with storage.translate_write_errors(part), part.open("ab" if start else "wb") as file:
-            while block := answer.read(CHUNK_BYTES):
+            while block := response.read(CHUNK_BYTES):
                 file.write(block)
-                show(file.tell() // 10**6, whole // 10**6)
-        if _size(part) < whole:
-            raise http.client.IncompleteRead(b"", whole - _size(part))
+                report_progress(file.tell() // 10**6, total // 10**6)
+        if _size(part) < total:
+            raise http.client.IncompleteRead(b"", total - _size(part))
 
 
-def _require_size(known: Published | None, size: int, *, where: str) -> None:
-    """Refuse a file of another size than the published one; estimated sizes still exclude error pages from a proxy."""
-    if known is None:
+def _require_size(published: Published | None, size: int, *, where: str) -> None:
+    """Check the size of a file; an approximate size is sufficient to detect an error page from a proxy."""
+    if published is None:
         return
-    around = [round(known.gigabytes * share * 10**9) for share in (1 - _TOLERANCE, 1 + _TOLERANCE)]
-    least, most = around if known.bytes is None else (known.bytes, known.bytes)
-    if not least <= size <= most:
-        needed = f"{known.name}, of {least:,} to {most:,} bytes"
+    bounds = [round(published.gigabytes * share * 10**9) for share in (1 - _TOLERANCE, 1 + _TOLERANCE)]
+    smallest, largest = bounds if published.bytes is None else (published.bytes, published.bytes)
+    if not smallest <= size <= largest:
+        needed = f"{published.name}, of {smallest:,} to {largest:,} bytes"
         fix = f"{_PROXY}; or delete the file, or name another with --to"
         raise InputError(where=where, found=f"a file of {size:,} bytes", needed=needed, fix=fix)
 

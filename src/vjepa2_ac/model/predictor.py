@@ -16,7 +16,7 @@ from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.episode import EXTRINSICS_DIM
 from vjepa2_ac.errors import quiet_imports
 from vjepa2_ac.model.attention import Attend, AttentionKind, TokenLayout, rotary_tables
-from vjepa2_ac.model.blocks import NORM_EPSILON, Block, hidden_width, initialise, normalised
+from vjepa2_ac.model.blocks import NORM_EPSILON, Block, apply_norm, hidden_width, initialise
 from vjepa2_ac.model.compilation import When
 
 with quiet_imports():
@@ -44,8 +44,8 @@ class KeyValueCache:
 
     def append(self, added: Sequence[Float[Tensor, "2 batch heads tokens head_dim"]]) -> None:
         """Add keys and values of further tokens, one piece for every layer."""
-        before = self._pieces or ((),) * len(added)
-        self._pieces = tuple((*pieces, piece) for pieces, piece in zip(before, added, strict=True))
+        pieces_by_layer = self._pieces or ((),) * len(added)
+        self._pieces = tuple((*pieces, piece) for pieces, piece in zip(pieces_by_layer, added, strict=True))
 
     def copy(self) -> KeyValueCache:
         """Return a cache with the same tensors that can grow independently."""
@@ -81,7 +81,8 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         self.action_encoder = nn.Linear(config.action_dim, width)
         if config.use_states:
             self.state_encoder = nn.Linear(config.state_dim, width)
-        if config.use_states or config.use_extrinsics:  # with states always, as in the official checkpoint
+        # The official checkpoint has this layer although the model does not use extrinsics.
+        if config.use_states or config.use_extrinsics:
             self.extrinsics_encoder = nn.Linear(EXTRINSICS_DIM, width)
         self.blocks = nn.ModuleList(
             Block(width, config.num_attention_heads, hidden, layer=index + 1)
@@ -123,17 +124,17 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
             states: The state of each step; ignored, and of any width, if the model has no states.
             extrinsics: The camera pose of each step, if the model uses it.
             cache: The steps follow those in the cache and attend to them; then they are added to the cache.
-            keep: Number of steps to add to the cache, from the first; None for all steps.
+            keep: Number of steps, counted from the first, that are added to the cache; None for all steps.
 
         Raises:
             ValueError: Extrinsics are missing or unexpected.
         """
         tokens, layout = self._assemble(latents, actions, states, extrinsics, cache)
-        tokens = self._through_blocks(tokens, layout, cache, keep)
+        tokens = self._run_blocks(tokens, layout, cache, keep)
         patches = rearrange(tokens, "batch (time token) width -> batch time token width", time=layout.steps)[
             :, :, layout.conditioning :
         ]
-        return _in_own_type(self.predictor_proj, normalised(self.predictor_norm, patches), self._dtype)
+        return _apply_in_weight_dtype(self.predictor_proj, apply_norm(self.predictor_norm, patches), self._dtype)
 
     def _assemble(
         self,
@@ -148,40 +149,38 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
             raise ValueError(
                 f"use_extrinsics is {self.config.use_extrinsics}, extrinsics given: {extrinsics is not None}"
             )
-        given = [(self.action_encoder, actions)]
-        given += [(self.state_encoder, states)] if self.config.use_states else []
-        given += [] if extrinsics is None else [(self.extrinsics_encoder, extrinsics)]
-        conditions = [_in_own_type(layer, values, self._dtype) for layer, values in given]
-        patches = _in_own_type(self.predictor_embed, latents, self._dtype)
+        inputs = [(self.action_encoder, actions)]
+        inputs += [(self.state_encoder, states)] if self.config.use_states else []
+        inputs += [] if extrinsics is None else [(self.extrinsics_encoder, extrinsics)]
+        conditions = [_apply_in_weight_dtype(layer, values, self._dtype) for layer, values in inputs]
+        patches = _apply_in_weight_dtype(self.predictor_embed, latents, self._dtype)
         tokens = torch.cat([torch.stack(conditions, dim=2), patches], dim=2)
         start = 0 if cache is None else cache.tokens // tokens.shape[2]
         return tokens.flatten(1, 2), TokenLayout(latents.shape[1], self.grid, len(conditions), start)
 
-    def _through_blocks(
-        self, tokens: Tensor, layout: TokenLayout, cache: KeyValueCache | None, keep: int | None
-    ) -> Tensor:
+    def _run_blocks(self, tokens: Tensor, layout: TokenLayout, cache: KeyValueCache | None, keep: int | None) -> Tensor:
         """Return the output tokens of all blocks, which attend to the cache; add new keys and values to the cache."""
         tables = rotary_tables(layout, tokens.shape[-1] // self.config.num_attention_heads, tokens.device)
-        how = (tables, layout.tokens_per_step, self.attention)
+        settings = (tables, layout.tokens_per_step, self.attention)
         steps = layout.steps if keep is None else min(keep, layout.steps)
-        kept_tokens = 0 if cache is None else steps * layout.tokens_per_step
+        num_saved_tokens = 0 if cache is None else steps * layout.tokens_per_step
         added: list[Tensor] = []
         for index, block in enumerate(self.blocks):
             past = () if cache is None else cache.layer(index)
             if self.gradient_checkpointing and torch.is_grad_enabled():
-                given = (tokens, *how, kept_tokens, *past)
-                tokens, kept = checkpoint(block, *given, use_reentrant=False, preserve_rng_state=self.has_dropout)
+                arguments = (tokens, *settings, num_saved_tokens, *past)
+                tokens, saved = checkpoint(block, *arguments, use_reentrant=False, preserve_rng_state=self.has_dropout)
             else:
-                tokens, kept = block(tokens, *how, kept_tokens, *past)
-            if kept is not None:
-                added.append(kept)
+                tokens, saved = block(tokens, *settings, num_saved_tokens, *past)
+            if saved is not None:
+                added.append(saved)
         if cache is not None and added:
             cache.append(added)
         return tokens
 
     @property
     def _dtype(self) -> torch.dtype:
-        """The data type of the base weights; a directly trained input layer may have another."""
+        """The data type of the base weights; directly trained input layers may have another data type."""
         return self.predictor_norm.weight.dtype
 
     def initialise(self, generator: Generator) -> None:
@@ -196,9 +195,9 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         narrower than the latents can copy only a random part of them (`ModelSizes.narrow_predictor_warning`).
         """
         shape = self.predictor_embed.weight.shape
-        drawn = torch.randn(max(shape), min(shape), generator=generator, device=generator.device)
-        drawn = drawn.double()  # in float32 the last bits would depend on the number of threads
-        rotation, triangle = torch.linalg.qr(drawn)
+        gaussian = torch.randn(max(shape), min(shape), generator=generator, device=generator.device)
+        gaussian = gaussian.double()  # in float32 the last bits would depend on the number of threads
+        rotation, triangle = torch.linalg.qr(gaussian)
         rotation = rotation * triangle.diagonal().sign()
         with torch.no_grad():
             self.predictor_embed.weight.copy_(rotation if shape[0] >= shape[1] else rotation.T)
@@ -216,24 +215,27 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
 
 def new_predictor(sizes: ModelSizes) -> ActionConditionedPredictor:
     """Return a predictor of these sizes, not yet initialised."""
-    own = sizes.predictor.model_dump()
+    values = sizes.predictor.model_dump()
     renamed = {"width": "hidden_size", "depth": "num_hidden_layers", "heads": "num_attention_heads"}
-    fields = {renamed.get(name, name): value for name, value in own.items()}
+    fields = {renamed.get(name, name): value for name, value in values.items()}
     config = PredictorConfig(
         image_size=sizes.image_size, patch_size=sizes.patch_size, latent_dim=sizes.encoder.width, **fields
     )
     return ActionConditionedPredictor(config)
 
 
-def _in_own_type(layer: Any, values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Apply a layer that may be trained, hence float32, in a predictor of another data type, without autocast."""
+def _apply_in_weight_dtype(layer: Any, values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Apply a layer in the data type of its weights and cast the result to `dtype`, unless autocast does so.
+
+    A directly trained layer is float32 in a predictor of another data type.
+    """
     if torch.is_autocast_enabled(values.device.type):
-        return layer(values)  # type: ignore[no-any-return]  # PEFT may be around it, untyped
-    return layer(values.to(layer.weight.dtype)).to(dtype)  # type: ignore[no-any-return]  # the same
+        return layer(values)  # type: ignore[no-any-return]  # PEFT's wrapper has no types
+    return layer(values.to(layer.weight.dtype)).to(dtype)  # type: ignore[no-any-return]  # PEFT's wrapper has no types
 
 
 class LatentDynamics(nn.Module):
-    """A predictor of latents, with or without an adapter around it; predictions are layer-normalised, in float32."""
+    """A predictor of latents, with or without an adapter; predictions are layer-normalised, in float32."""
 
     predictor: nn.Module
 
@@ -245,8 +247,8 @@ class LatentDynamics(nn.Module):
     @property
     def base_predictor(self) -> Any:
         """The predictor without PEFT's wrapper."""
-        wrapped = getattr(self.predictor, "get_base_model", None)  # a method of PEFT's wrapper
-        return wrapped() if wrapped else self.predictor
+        get_base_model = getattr(self.predictor, "get_base_model", None)  # a method of PEFT's wrapper
+        return get_base_model() if get_base_model else self.predictor
 
     def predict(
         self,
@@ -274,12 +276,12 @@ class LatentDynamics(nn.Module):
         """Return a rollout: predictions of the steps after the context, each used as input for the next prediction.
 
         With frames counted from 0, the context contains frames 0 .. context-1 and the result frames context .. time.
-        The first is predicted from the context alone, so that index h - 1 is horizon h, and there are time - context +
-        1 predictions. The context may end with a prediction, to continue a rollout from it.
+        The first prediction is made from the context alone, so that index h - 1 is horizon h. There are
+        time - context + 1 predictions. The context may end with a prediction, to continue an earlier rollout.
 
-        The context is computed in one pass, then one step at a time with cached keys and values. With a cache, context,
-        actions and states follow the steps in the cache. The cache is not changed, so that many rollouts can start from
-        it.
+        The context is computed in one pass. Each later step is one pass with cached keys and values. With a cache,
+        context, actions and states follow the steps in the cache. The cache is not changed, so that many rollouts can
+        start from the same cache.
 
         Raises:
             ValueError: There are fewer actions than context latents.
@@ -292,7 +294,7 @@ class LatentDynamics(nn.Module):
         predicted = []
         for end in range(first, last + 1):
             camera = None if extrinsics is None else extrinsics[:, start:end]
-            keep = None if end < last else 0  # the last step needs not be cached
+            keep = None if end < last else 0  # no later step reads the last step from the cache
             following = self.predict(latents, actions[:, start:end], states[:, start:end], camera, cache, keep)
             latents, start = following[:, -1:], end
             predicted.append(latents)
@@ -302,7 +304,8 @@ class LatentDynamics(nn.Module):
         """Choose whether predictor blocks are recomputed in the backward pass instead of storing their activations."""
         predictor = self.base_predictor
         predictor.gradient_checkpointing = enabled
-        predictor.has_dropout = any(isinstance(one, nn.Dropout) and one.p > 0 for one in predictor.blocks.modules())
+        dropouts = (module for module in predictor.blocks.modules() if isinstance(module, nn.Dropout))
+        predictor.has_dropout = any(dropout.p > 0 for dropout in dropouts)
 
     def set_compiled(self, when: When) -> None:
         """Choose when predictor blocks are compiled (see `model.compilation`)."""

@@ -62,7 +62,7 @@ class RemovedEncoder(nn.Module):
 
     def __init__(self, fingerprint: str) -> None:
         super().__init__()
-        self.fingerprint = fingerprint  # that of the removed encoder
+        self.fingerprint = fingerprint  # of the removed encoder
 
 
 class WorldModel(LatentDynamics):
@@ -98,8 +98,7 @@ class WorldModel(LatentDynamics):
         """Return a randomly initialised model, with the same weights for the same sizes, seed and device type.
 
         Weights are drawn as in the released recipe; with `near_persistence` the predictor starts close to persistence.
-        They are drawn on the device: the full size takes half a minute on one CPU core, and no noticeable time on a
-        GPU.
+        They are drawn on the device; for the full size this takes half a minute on one CPU core.
         """
         model = cls.empty(sizes).to_empty(device=device)
         generator = torch.Generator(device).manual_seed(seed)
@@ -108,7 +107,7 @@ class WorldModel(LatentDynamics):
         return model.to(dtype)
 
     def draw_predictor(self, generator: torch.Generator, dtype: torch.dtype, *, near_persistence: bool = False) -> None:
-        """Initialise the predictor on the generator's device; it may be on the meta device before."""
+        """Initialise the predictor on the generator's device; its current weights may be on the meta device."""
         predictor = self.base_predictor.to_empty(device=generator.device)
         predictor.initialise(generator)
         if near_persistence:
@@ -117,7 +116,7 @@ class WorldModel(LatentDynamics):
 
     @classmethod
     def empty(cls, sizes: ModelSizes) -> WorldModel:
-        """Return a model without weights (on the meta device), for loaders to fill; in eval mode."""
+        """Return a model in eval mode without weights (on the meta device), into which weights can be loaded."""
         with torch.device("meta"):
             return cls(sizes).eval()
 
@@ -216,10 +215,10 @@ class WorldModel(LatentDynamics):
         """Return a hash of the encoder's tensors and other properties, which is part of the key of cached latents."""
         if isinstance(self.encoder, RemovedEncoder):
             return self.encoder.fingerprint
-        tensors, beyond = fingerprint(self.encoder.state_dict()), self.encoder_properties
-        if not beyond:  # the same for all files with these tensors
+        tensors, properties = fingerprint(self.encoder.state_dict()), self.encoder_properties
+        if not properties:
             return tensors
-        return hashlib.sha256(json.dumps([tensors, beyond], sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps([tensors, properties], sort_keys=True).encode()).hexdigest()
 
     @property
     def encoder_properties(self) -> dict[str, str | int]:
@@ -227,12 +226,12 @@ class WorldModel(LatentDynamics):
 
         Empty for tubelets of V-JEPA 2 with the published number of heads, and for a model created with its encoder.
         """
-        sizes, origin, beyond = self.sizes.encoder, self.encoder_origin, dict[str, str | int]()
+        sizes, origin, properties = self.sizes.encoder, self.encoder_origin, dict[str, str | int]()
         if sizes.family != "v2":
-            beyond |= {"encoder.family": sizes.family, "encoder.frame": sizes.frame}
+            properties |= {"encoder.family": sizes.family, "encoder.frame": sizes.frame}
         if origin is not None and origin.has_heads_in_fingerprint and PUBLISHED_HEADS.get(sizes.width) != sizes.heads:
-            beyond["encoder.heads"] = sizes.heads
-        return beyond
+            properties["encoder.heads"] = sizes.heads
+        return properties
 
     @property
     def encoder_description(self) -> str:
@@ -247,10 +246,10 @@ class WorldModel(LatentDynamics):
         """Return the hashes of base and trained weights; for a merged model those before the merge."""
         if self.merged_from is not None:
             return self.merged_from
-        adapted, whole = self.adaptation, fingerprint(self.predictor.state_dict())
-        if adapted is not None:
-            return Fingerprints(adapted.encoder, adapted.base, whole)
-        return Fingerprints(self.encoder_fingerprint(), self.predictor_fingerprint(), whole)
+        adaptation, predictor = self.adaptation, fingerprint(self.predictor.state_dict())
+        if adaptation is not None:
+            return Fingerprints(adaptation.encoder, adaptation.base, predictor)
+        return Fingerprints(self.encoder_fingerprint(), self.predictor_fingerprint(), predictor)
 
     def predictor_fingerprint(self) -> str:
         """Return a hash of the base model's predictor, independent of an adapter and of new input layers."""
@@ -283,41 +282,42 @@ def base_weights(predictor: nn.Module) -> dict[str, Tensor]:
 def find_heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
     """Return the names of the input layers that do not fit states and actions of these widths.
 
-    States of any width fit a model without states.
+    A model without states fits states of any width.
     """
-    own = sizes.predictor
+    predictor = sizes.predictor
     fits = {
-        "action_encoder": own.action_dim == widths.action,
-        "state_encoder": not own.use_states or own.state_dim == widths.state,
+        "action_encoder": predictor.action_dim == widths.action,
+        "state_encoder": not predictor.use_states or predictor.state_dim == widths.state,
     }
-    return tuple(name for name, does in fits.items() if not does)
+    return tuple(name for name, is_suitable in fits.items() if not is_suitable)
 
 
 def require_trained_heads(heads: tuple[str, ...], config: AdapterConfig) -> None:
     """Check that new input layers are trained.
 
     Raises:
-        InputError: An adapter is trained, and a new layer is not in its modules_to_save; shows the setting.
+        InputError: An adapter is trained, and a new layer is not in its modules_to_save; the message shows the setting.
     """
     missing = [name for name in heads if name not in config.modules_to_save]
     if config.kind == "none" or not missing:
         return
-    whole = ", ".join([*config.modules_to_save, *missing])
-    found = f"the new {_as_text(missing)} would not be trained; the data have other widths than the base model"
-    raise InputError(where="adapter.modules_to_save", found=found, fix=f"Set adapter.modules_to_save=[{whole}]")
+    layers = ", ".join([*config.modules_to_save, *missing])
+    problem = f"the new {_join_names(missing)} would not be trained; the data have other widths than the base model"
+    raise InputError(where="adapter.modules_to_save", found=problem, fix=f"Set adapter.modules_to_save=[{layers}]")
 
 
 def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
-    """Replace the input layers that do not fit states and actions of these widths by new ones.
+    """Replace the input layers that do not fit states and actions of these widths by new layers.
 
-    They are initialised as in the released recipe, from the seed and the name of the layer. The identity of the base
-    model (`WorldModel.predictor_fingerprint`) does not change, but without training the model predicts noise.
+    The new layers are initialised as in the released recipe, with a seed derived from `seed` and the name of the layer.
+    The fingerprint of the base model (`WorldModel.predictor_fingerprint`) does not change, but the model predicts noise
+    until the new layers are trained.
 
     Returns:
         A line for each replaced layer.
 
     Raises:
-        ValueError: The model is adapted, or has new input layers already.
+        ValueError: The model has an adapter or new input layers already.
     """
     heads = find_heads_to_replace(model.sizes, widths)
     if not heads:
@@ -328,14 +328,13 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
     replaced: dict[str, Tensor] = {}
     lines: list[str] = []
     for name in heads:
-        own, width = getattr(predictor, name), widths.action if name == "action_encoder" else widths.state
-        replaced |= {f"{name}.{key}": value.detach().cpu() for key, value in own.state_dict().items()}
-        head = nn.Linear(width, own.out_features)
+        old_head, width = getattr(predictor, name), widths.action if name == "action_encoder" else widths.state
+        replaced |= {f"{name}.{key}": value.detach().cpu() for key, value in old_head.state_dict().items()}
+        head = nn.Linear(width, old_head.out_features)
         initialise(head, torch.Generator().manual_seed(derive_seed(seed, name)))
-        setattr(predictor, name, head.to(own.weight.device, own.weight.dtype).requires_grad_(False))
-        lines.append(
-            f"New {_as_text([name])} for {width} numbers, newly initialised; the base model's has {own.in_features}."
-        )
+        setattr(predictor, name, head.to(old_head.weight.device, old_head.weight.dtype).requires_grad_(False))
+        label, old_width = _join_names([name]), old_head.in_features
+        lines.append(f"New {label} for {width} numbers, newly initialised; the base model's has {old_width}.")
     dims = {"action_dim": widths.action}
     dims |= {"state_dim": widths.state} if model.sizes.predictor.use_states else {}
     predictor.config.update(dims)
@@ -347,17 +346,20 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
 def get_model_widths(sizes: ModelSizes) -> Widths:
     """Return the widths of a model's states and actions.
 
-    For a model without states the width of a state is that of an action, because a plan adds actions to states.
+    For a model without states the width of a state equals the width of an action, because a plan adds actions to
+    states.
     """
-    own = sizes.predictor
-    return Widths(state=own.state_dim if own.use_states else own.action_dim, action=own.action_dim)
+    predictor = sizes.predictor
+    return Widths(
+        state=predictor.state_dim if predictor.use_states else predictor.action_dim, action=predictor.action_dim
+    )
 
 
 def describe_model_widths(sizes: ModelSizes) -> str:
     """Describe the states and actions that a model accepts, for messages."""
-    own = sizes.predictor
-    states = f"states of {own.state_dim}" if own.use_states else "any states"
-    return f"{states} and actions of {own.action_dim} numbers"
+    predictor = sizes.predictor
+    states = f"states of {predictor.state_dim}" if predictor.use_states else "any states"
+    return f"{states} and actions of {predictor.action_dim} numbers"
 
 
 def derive_seed(*parts: object) -> int:
@@ -366,5 +368,5 @@ def derive_seed(*parts: object) -> int:
     return int.from_bytes(digest, "big") >> 1
 
 
-def _as_text(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
     return " and the ".join(name.replace("_", " ") for name in names)

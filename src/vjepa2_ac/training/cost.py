@@ -243,7 +243,7 @@ def _measure(config: Config, sizes: ModelSizes, device: Kind) -> tuple[tuple[int
             before = holding.storages.live
             matrices = CastMatrices(model, PRECISIONS[config.training.precision])
             casts = holding.storages.live - before
-            with matrices.current():
+            with matrices.use():
                 stored = model.run(config, sizes, config.training.batch_size, train=True)
                 model.set_gradient_checkpointing(True)
                 checkpointed = model.run(config, sizes, config.training.batch_size, train=True)

@@ -165,7 +165,7 @@ def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
         run.world_model.train()
     totals, names, error = torch.zeros(2), list[str](), None
     try:
-        with run.cast_matrices.current():
+        with run.cast_matrices.use():
             totals, names = _accumulate(run, batches)
     except UserError as raised:
         error = raised

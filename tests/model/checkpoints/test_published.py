@@ -142,9 +142,9 @@ def test_less_than_the_published_file_is_not_taken_for_it(serve, tmp_path: Path)
     part.write_bytes(CONTENT[:1000])
     url = serve(Behaviour(content=b"please wait", resumes=False))
     with pytest.raises(InputError, match=r"a file of 11 bytes\. Expected made-up, of 102,400 to 102,400 bytes.*proxy"):
-        download(url, tmp_path / "made-up.pt", known=MADE_UP)
+        download(url, tmp_path / "made-up.pt", published=MADE_UP)
     assert part.read_bytes() == CONTENT[:1000]  # hours of a good line are not thrown away
-    assert download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP).read_bytes() == CONTENT
+    assert download(serve(Behaviour()), tmp_path / "made-up.pt", published=MADE_UP).read_bytes() == CONTENT
 
 
 def test_existing_file_of_a_wrong_size_raises_with_its_path(serve, tmp_path: Path) -> None:
@@ -152,9 +152,9 @@ def test_existing_file_of_a_wrong_size_raises_with_its_path(serve, tmp_path: Pat
     path, url = tmp_path / "made-up.pt", serve(behaviour)
     path.write_bytes(b"<html>")
     with pytest.raises(InputError, match=r"made-up\.pt: a file of 6 bytes.*or name another with --to"):
-        download(url, path, known=MADE_UP)
+        download(url, path, published=MADE_UP)
     with pytest.raises(InputError, match=r"a folder\. Expected the name of a file"):
-        download(url, tmp_path, known=MADE_UP)
+        download(url, tmp_path, published=MADE_UP)
     assert behaviour.seen == []
 
 
@@ -165,7 +165,7 @@ def test_disk_space_for_the_rest_is_checked_before_the_first_byte(
     part = tmp_path / PART
     part.write_bytes(CONTENT[:1000])
     with pytest.raises(InputError, match=r"GB free on its disk\. Expected 0\.0001024 GB.*--to"):
-        download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP)
+        download(serve(Behaviour()), tmp_path / "made-up.pt", published=MADE_UP)
     assert part.read_bytes() == CONTENT[:1000]
 
 
