@@ -25,7 +25,7 @@ from vjepa2_ac.config.section import (
 from vjepa2_ac.errors import did_you_mean
 from vjepa2_ac.registry import SOURCES, TRANSFORMS
 
-# YAML parses the serial number of a camera as an integer.
+# YAML parses the serial number of a camera as an integer, so that it is converted to text.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 
 Split = Literal["train", "validation", "test"]
@@ -33,7 +33,7 @@ RotationFormat = Literal["euler_xyz", "euler_xyz_degrees", "rotation_vector", "q
 _JOINED = "to sum (deltas), mean (velocities) or last (absolute targets)"
 
 
-def _split_by(text: str) -> str:
+def _validate_split_by(text: str) -> str:
     """Validate `data.split_by`: the name of a field, or a regular expression with one group.
 
     The names of fields depend on the data set and are checked later.
@@ -134,12 +134,12 @@ class DataConfig(Section):
     """
 
     affects: ClassVar[Affects] = Affects.CLIPS
-    kinds: ClassVar[dict[str, type[DataConfig]]] = {}  # all known data formats: source -> subclass
+    kinds: ClassVar[dict[str, type[DataConfig]]] = {}  # all registered data formats: source -> subclass
     reader: ClassVar[str]  # the class that reads the episodes, as module:class; imported when the data are opened
     is_cache: ClassVar[bool] = False  # whether it is a latent cache, without frames and with one stride
     has_camera_poses: ClassVar[bool] = True
     has_vectors: ClassVar[bool] = True  # whether `states: vector` is possible
-    same_identity_fix: ClassVar[str] = ""  # the fix in the error about two episodes of one identity
+    same_identity_fix: ClassVar[str] = ""  # the fix in the error about two episodes with the same identity
     constants: ClassVar[dict[str, dict[str, Any]]] = {}  # options of 0.1 that are part of the keys of caches
 
     source: str
@@ -177,7 +177,9 @@ class DataConfig(Section):
     """How the splits defined by the data set are used, if there are several (RLDS, LeRobot). dataset: train, val (or
     valid, validation) and test are used as such; a missing one is drawn from train by its share, and splits of other
     names belong to train. hash: all episodes are pooled, and the splits are drawn from them by the shares."""
-    split_by: Annotated[Annotated[str, Field(max_length=500), AfterValidator(_split_by)] | None, Affects.RUN] = None
+    split_by: Annotated[
+        Annotated[str, Field(max_length=500), AfterValidator(_validate_split_by)] | None, Affects.RUN
+    ] = None
     """Keeps related episodes in one split, to avoid leakage between splits: a field (lab, day or folder from the
     identity; task, scene, building, operator or day from the data set), or a regular expression with one group, which
     is searched in the identity. null: each episode is drawn independently."""
@@ -248,7 +250,7 @@ class DataConfig(Section):
         known, cameras = self.known_cameras, self.cameras
         unknown = [camera for camera in cameras if known is not None and camera not in known]
         available = f"{did_you_mean(unknown[0], known or ())}Available: {', '.join(known or ())}" if unknown else ""
-        splits, of_camera = self.validation_share + self.test_share, self.pose_frame == "camera"
+        splits, is_camera_frame = self.validation_share + self.test_share, self.pose_frame == "camera"
         return self.check_rules(
             (
                 not cameras,
@@ -269,30 +271,30 @@ class DataConfig(Section):
             ),
             (splits >= 1.0, "validation_share and test_share leave nothing to train on"),
             (
-                of_camera and not self.has_camera_poses,
+                is_camera_frame and not self.has_camera_poses,
                 f"pose_frame: source {self.source} has no camera poses. Set pose_frame: base",
             ),
         )
 
     @model_validator(mode="after")
     def _vectors_fit(self) -> DataConfig:
-        of_poses = {
+        pose_options = {
             f"source {self.source}": not self.has_vectors,
             "pose_frame camera": self.pose_frame == "camera",
             "idle.rule motion": self.idle.rule == "motion",
         }
         section, fields = self.pose_fields
         formats = fields.pose_keys if fields else ()
-        asked = [*(name for name, is_asked in of_poses.items() if is_asked), *(f"{section}.{key}" for key in formats)]
+        used = [*(name for name, is_used in pose_options.items() if is_used), *(f"{section}.{key}" for key in formats)]
         is_vector, is_recorded = self.states == "vector", self.actions == "recorded"
-        has_many = is_recorded and self.stride != 1 and self.join_actions is None
+        needs_join = is_recorded and self.stride != 1 and self.join_actions is None
         return self.check_rules(
-            (is_vector and asked, f"{', '.join(asked)}: only for poses, and states is vector"),
+            (is_vector and used, f"{', '.join(used)}: only for poses, and states is vector"),
             (
                 is_recorded and not is_vector,
                 "actions: recorded needs states: vector, because the action of a pose is its difference",
             ),
-            (has_many, f"actions: recorded at stride {self.stride} needs join_actions. Set it {_JOINED}"),
+            (needs_join, f"actions: recorded at stride {self.stride} needs join_actions. Set it {_JOINED}"),
             (not is_recorded and self.join_actions is not None, "join_actions is only for actions: recorded"),
         )
 
@@ -340,8 +342,9 @@ class DataConfig(Section):
     @classmethod
     def format_sections(cls) -> dict[str, type[Section]]:
         """Return the sections that only this data format has."""
-        own = [(name, one.annotation) for name, one in cls.model_fields.items() if name not in DataConfig.model_fields]
-        return {name: kind for name, kind in own if isinstance(kind, type) and issubclass(kind, Section)}
+        names = cls.model_fields.keys() - DataConfig.model_fields.keys()
+        kinds = {name: field.annotation for name, field in cls.model_fields.items() if name in names}
+        return {name: kind for name, kind in kinds.items() if isinstance(kind, type) and issubclass(kind, Section)}
 
     @property
     def format_values(self) -> dict[str, dict[str, Any]]:

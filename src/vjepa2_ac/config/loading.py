@@ -29,9 +29,10 @@ from vjepa2_ac.storage.paths import BUILTIN, NO_DATA
 from vjepa2_ac.storage.structured import describe_validation_error, parse_yaml
 
 _MOST_BYTES = 1_000_000  # size limit of a config file: PyYAML needs a minute for 20 MB
-# Cached because a command reads the config of its run several times, 20 ms each. `parse_config` copies the values.
+# Cached because a command reads the config of its run several times, which takes 20 ms each. `parse_config` copies the
+# values, so that the cached ones do not change.
 _parse_document = lru_cache(maxsize=8)(parse_yaml)
-_OF_A_RUN = ("run_id", "environment.json", "metrics.jsonl")  # files of which a run folder has at least one
+_RUN_FILES = ("run_id", "environment.json", "metrics.jsonl")  # a run folder contains at least one of these files
 _PACKAGED = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "configs"
 
 
@@ -54,8 +55,8 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
     if isinstance(config, Mapping):
         return parse_config(config, overrides, where="load_config")
     path = config_path(config)
-    of_run = any((path.parent / name).exists() for name in _OF_A_RUN)
-    return parse_config(_read_yaml(path), overrides, where=str(config), local_plugins=not of_run)
+    is_of_run = any((path.parent / name).exists() for name in _RUN_FILES)
+    return parse_config(_read_yaml(path), overrides, where=str(config), local_plugins=not is_of_run)
 
 
 def config_of_model(base: str, overrides: Iterable[str] = (), *, where: str = "overrides", **model: Any) -> Config:
@@ -93,10 +94,10 @@ def config_path(name: str | Path) -> Path:
     """
     if not str(name).startswith(BUILTIN):
         return Path(name)
-    if (known := str(name).removeprefix(BUILTIN)) not in packaged_configs():
-        needed = f"one of {', '.join(f'{BUILTIN}{one}' for one in packaged_configs())}"
+    if (stem := str(name).removeprefix(BUILTIN)) not in packaged_configs():
+        needed = f"one of {', '.join(f'{BUILTIN}{config}' for config in packaged_configs())}"
         raise InputError(where=str(name), found="the package has no config of this name", needed=needed)
-    return _PACKAGED / f"{known}.yaml"
+    return _PACKAGED / f"{stem}.yaml"
 
 
 def parse_config(
@@ -124,7 +125,7 @@ def parse_config(
         key, separator, text = override.partition("=")
         if not separator or not key:
             raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
-        _set(plain, key.split("."), parse_yaml(text, where=f"override {key}"), override)
+        _set_value(plain, key.split("."), parse_yaml(text, where=f"override {key}"), override)
     _replace_older_keys(plain)
     if isinstance(plain.get("model"), dict):
         _replace_keys_of_model(plain["model"])
@@ -133,8 +134,8 @@ def parse_config(
         return Config.model_validate_json(_as_json(with_complete_replay(plain), where))
     except ValidationError as error:
         lines = _wrong_values(error)
-    found = "\n  ".join([f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong", *lines]) + "\n"
-    raise InputError(where=where, found=found, fix="`vjepa2-ac config schema` lists every key with its range")
+    problem = "\n  ".join([f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong", *lines]) + "\n"
+    raise InputError(where=where, found=problem, fix="`vjepa2-ac config schema` lists every key with its range")
 
 
 def config_as_dict(config: Config) -> dict[str, Any]:
@@ -161,7 +162,7 @@ def config_as_yaml(config: Config) -> str:
 
 
 def yaml_line(key: str, value: Any) -> str:
-    """Return a key and its value as one line of YAML, which is parsed to the same key and value."""
+    """Return a key and its value as one line of YAML."""
     text = yaml.dump([{key: value}], Dumper=_Dumper, sort_keys=False, default_flow_style=True, width=_NO_BREAKS)
     return str(text).removeprefix("[{").removesuffix("}]\n")
 
@@ -178,11 +179,11 @@ def changed_keys(old: Config, new: Config) -> list[str]:
     return sorted(key for key in flat_old.keys() | flat_new.keys() if flat_old.get(key) != flat_new.get(key))
 
 
-_NO_BREAKS = 10**6  # characters per line, so that YAML breaks none
+_NO_BREAKS = 10**6  # characters per line, so that YAML breaks no line
 
 
 class _Dumper(yaml.SafeDumper):
-    """A YAML dumper that quotes text of which YAML would make another type, and escapes unprintable characters."""
+    """A YAML dumper that quotes text which YAML would parse as another type, and escapes unprintable characters."""
 
 
 _Dumper.add_representer(
@@ -222,39 +223,39 @@ def _as_json(values: Mapping[str, Any], where: str) -> str:
         raise InputError(where=where, found=f"a value that a config cannot contain ({error})") from None
 
 
-_KEYS_OF_A_RUN = {"check_crc", "connections", "prefetch", "short_episodes"}
+_RARELY_WRITTEN_KEYS = {"check_crc", "connections", "prefetch", "short_episodes"}
 
 
 def _keep_drawn_splits(values: Mapping[str, Any]) -> None:
     """Set `data.splits` to hash in the config of an older run without this key, because all its splits were drawn.
 
-    The config of a run contains all keys of its version. It is recognised by keys that users seldom write.
+    The config of a run contains all keys of its version. It is recognised by keys that users rarely write.
     """
     replay = values.get("replay")
     for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):
-        if isinstance(data, dict) and data.keys() >= _KEYS_OF_A_RUN:
+        if isinstance(data, dict) and data.keys() >= _RARELY_WRITTEN_KEYS:
             data.setdefault("splits", "hash")
 
 
-def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> None:
+def _set_value(values: dict[str, Any], keys: list[str], value: Any, override: str) -> None:
     for depth, key in enumerate(keys[:-1]):
         if values.get(key) is None:
             values[key] = {}
         if isinstance(values[key], str) and keys[depth + 1] == "options":
-            values[key] = {"name": values[key]}  # a component given by its name
+            values[key] = {"name": values[key]}  # a component that was set by its name only
         inner = values[key]
         if not isinstance(inner, dict):
-            found = f"{'.'.join(keys[: depth + 1])} is a value"
-            raise InputError(where=f"override {override}", found=found, needed="a section")
+            problem = f"{'.'.join(keys[: depth + 1])} is a value"
+            raise InputError(where=f"override {override}", found=problem, needed="a section")
         values = inner
     if keys[-2:] == ["data", "source"] and value != values.get("source", "rlds"):
-        others = [kind for name, kind in DataConfig.kinds.items() if name != value]
-        for section in {section for kind in others for section in kind.format_sections()}:
-            values.pop(section, None)  # options of the former data format
+        former_formats = [kind for name, kind in DataConfig.kinds.items() if name != value]
+        for section in {section for kind in former_formats for section in kind.format_sections()}:
+            values.pop(section, None)  # options of the former data format would be unknown keys
     values[keys[-1]] = value
 
 
-_OLDER_GRIPPERS = {"closedness": {}, "openness": {"gripper_open": 1.0, "gripper_closed": 0.0}}
+_OLDER_GRIPPER_VALUES = {"closedness": {}, "openness": {"gripper_open": 1.0, "gripper_closed": 0.0}}
 
 
 def _replace_keys_of_model(model: dict[str, Any]) -> None:
@@ -270,15 +271,18 @@ def _replace_older_keys(values: dict[str, Any]) -> None:
             decay_steps = _steps_after_warmup(inner) if inner["schedule"] == "linear" else 0
             inner |= {"schedule": "warmup_stable_decay", "decay_steps": decay_steps}
         gripper = inner.get("gripper") if section == "fields" and isinstance(inner, dict) else None
-        if isinstance(gripper, str) and gripper in _OLDER_GRIPPERS:
+        if isinstance(gripper, str) and gripper in _OLDER_GRIPPER_VALUES:
             del inner["gripper"]
-            inner.update(_OLDER_GRIPPERS[gripper])
+            inner.update(_OLDER_GRIPPER_VALUES[gripper])
         elif isinstance(inner, dict):
             _replace_older_keys(inner)
 
 
 def _steps_after_warmup(training: Mapping[str, Any]) -> int:
-    """Return the number of steps after the warm-up; 0 if a value has a wrong type, which validation reports later."""
+    """Return the number of steps after the warm-up.
+
+    If a value has a wrong type, return 0, because validation reports this error later.
+    """
     steps = training.get("steps", TrainingConfig.model_fields["steps"].default)
     warmup_steps = training.get("warmup_steps")
     if not isinstance(steps, int) or not isinstance(warmup_steps, int | None):
@@ -288,7 +292,7 @@ def _steps_after_warmup(training: Mapping[str, Any]) -> int:
 
 # ---- plug-ins: modules that are imported before a config is validated, because it may use their components ----
 
-_named: list[str] = []  # modules of `--plugin`
+_command_line_plugins: list[str] = []  # modules of `--plugin`
 
 
 def register_plugins(modules: list[str]) -> None:
@@ -298,7 +302,7 @@ def register_plugins(modules: list[str]) -> None:
         InputError: A module does not exist.
     """
     import_plugins(modules, where="--plugin")
-    _named.extend(modules)
+    _command_line_plugins.extend(modules)
 
 
 def with_plugins(values: Mapping[str, Any], *, where: str, local_plugins: bool) -> dict[str, Any]:
@@ -316,10 +320,12 @@ def with_plugins(values: Mapping[str, Any], *, where: str, local_plugins: bool) 
     if configured is not None and not (
         isinstance(configured, list) and all(isinstance(module, str) for module in configured)
     ):
-        return dict(values)  # an error that validation reports
-    plugins = list(dict.fromkeys([*(configured or ()), *_named]))
+        return dict(values)  # validation reports this error later
+    plugins = list(dict.fromkeys([*(configured or ()), *_command_line_plugins]))
     import_plugins(
-        [module for module in plugins if module not in _named], where=f"{where}: plugins", here=local_plugins
+        [module for module in plugins if module not in _command_line_plugins],
+        where=f"{where}: plugins",
+        here=local_plugins,
     )
     replay = values.get("replay")
     for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):
@@ -379,11 +385,11 @@ def all_keys() -> list[str]:
 
 
 def _key_of(location: Sequence[Any]) -> str:
-    """Return the dotted key for an error location of pydantic, without its names for data formats and union types."""
+    """Return the dotted key for an error location of pydantic, without pydantic's names of data formats and types."""
     parts: list[str] = []
-    for before, part in zip(["", *location], map(str, location), strict=False):
-        is_form = before == "data" and part in DataConfig.kinds
-        if not is_form and not (_TYPE_OF_A_UNION.fullmatch(part) and to_data_key(".".join(parts)) in all_keys()):
+    for previous, part in zip(["", *location], map(str, location), strict=False):
+        is_format = previous == "data" and part in DataConfig.kinds
+        if not is_format and not (_TYPE_OF_A_UNION.fullmatch(part) and to_data_key(".".join(parts)) in all_keys()):
             parts.append(part)
     return ".".join(parts)
 
@@ -399,15 +405,15 @@ def _explain(key: str, detail: Any) -> str:
         return describe_validation_error(detail)
     key = to_data_key(key)
     section, dot, name = key.rpartition(".")
-    if (why := explain_removed_key(key)) is not None:
-        return why
+    if (explanation := explain_removed_key(key)) is not None:
+        return explanation
     if key in all_keys():
         owners = [source for source, kind in DataConfig.kinds.items() if name in kind.model_fields]
         return f"only for source {' or '.join(owners)}, and this is source {detail['loc'][-2]}"
     prefix = section + dot
-    siblings = [one.removeprefix(prefix) for one in all_keys() if one.rpartition(".")[0] == section]
-    close = difflib.get_close_matches(name, siblings, n=1)
-    elsewhere = [one for one in all_keys() if one.endswith(f".{name}")]
-    if meant := [*close, *elsewhere]:
-        return f"unknown key; did you mean {meant[0]}?"
+    siblings = [known.removeprefix(prefix) for known in all_keys() if known.rpartition(".")[0] == section]
+    close_siblings = difflib.get_close_matches(name, siblings, n=1)
+    same_name = [known for known in all_keys() if known.endswith(f".{name}")]
+    if suggestions := [*close_siblings, *same_name]:
+        return f"unknown key; did you mean {suggestions[0]}?"
     return f"unknown key; known here: {', '.join(siblings)}"

@@ -10,7 +10,8 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from vjepa2_ac.config.section import Affects, PositiveInt, Section, Share
 from vjepa2_ac.storage import paths
 
-# Limits far above the released model (width 1408, depth 40, 1.3 billion weights), because a file may claim any size.
+# Limits far above the released model (width 1408, depth 40, 1.3 billion weights). They protect from files with absurd
+# sizes.
 Width = Annotated[int, Field(ge=1, le=16_384)]
 Depth = Annotated[int, Field(ge=1, le=512)]
 Heads = Annotated[int, Field(ge=1, le=1_024)]
@@ -20,7 +21,7 @@ _MOST_TOKENS = 65_536  # per frame
 _MOST_WEIGHTS = 10**10  # 40 GB in float32
 _MOST_TARGETS = 4_096
 _STATE_DIM = 7  # position, rotation, gripper
-_USUAL_ALPHA = 32.0  # in all configs of the package, at any rank
+_DEFAULT_ALPHA = 32.0  # in all configs of the package, at any rank
 
 
 Family = Literal["v2", "v2.1"]
@@ -119,11 +120,11 @@ class ModelSizes(Section):
     @model_validator(mode="after")
     def _sizes_divide(self) -> ModelSizes:
         image, patch = self.image_size, self.patch_size
-        old, as_image = self.encoder.family == "v2", self.encoder.frame == "image"
+        is_v2, as_image = self.encoder.family == "v2", self.encoder.frame == "image"
         self.check_rules(
             (image % patch, f"image_size {image} is not a multiple of patch_size {patch}"),
-            (old and as_image, "encoder.frame: image needs V-JEPA 2.1. Set encoder.frame: tubelet"),
-            (not old and image == patch, "image_size of one patch: V-JEPA 2.1 needs a grid of two patches or more"),
+            (is_v2 and as_image, "encoder.frame: image needs V-JEPA 2.1. Set encoder.frame: tubelet"),
+            (not is_v2 and image == patch, "image_size of one patch: V-JEPA 2.1 needs a grid of two patches or more"),
         )
         for name, part in (("encoder", self.encoder), ("predictor", self.predictor)):
             head, rest = divmod(part.width, part.heads)
@@ -171,7 +172,7 @@ class SizesConfig(Section):
 
     @property
     def model_sizes(self) -> ModelSizes:
-        """All sizes: MLP widths as in the published models, and the widths of poses until the data are known."""
+        """All sizes, with the MLP widths of the published models and, until the data are known, the widths of poses."""
         released = EncoderSizes()
         ratio = released.mlp_ratio if self.encoder.width == released.width else 4.0
         encoder = EncoderSizes(mlp_ratio=ratio, **self.encoder.model_dump())
@@ -275,23 +276,23 @@ class AdapterConfig(Section):
     """Further options of PEFT's LoraConfig, for example {rank_pattern: {fc1: 32}, init_lora_weights: gaussian}."""
 
     @model_validator(mode="after")
-    def _is_an_adapter_of_this_base(self) -> AdapterConfig:
-        start = self.peft.get("init_lora_weights", True)
-        ours = [
+    def _keeps_the_base_weights(self) -> AdapterConfig:
+        initialisation = self.peft.get("init_lora_weights", True)
+        duplicates = [
             (True, f"peft.{name}: set adapter.{PEFT_NAMES[name]} instead") for name in self.peft if name in PEFT_NAMES
         ]
-        changes_base = start not in (True, False, "gaussian", "orthogonal")
-        why = "changes the base weights, which are not saved. Set true, false, gaussian or orthogonal"
-        return self.check_rules(*ours, (changes_base, f"peft.init_lora_weights {start!r} {why}"))
+        changes_base = initialisation not in (True, False, "gaussian", "orthogonal")
+        reason = "changes the base weights, which are not saved. Set true, false, gaussian or orthogonal"
+        return self.check_rules(*duplicates, (changes_base, f"peft.init_lora_weights {initialisation!r} {reason}"))
 
     @property
     def alpha_warning(self) -> str | None:
         """The warning if alpha seems to be raised with the rank although rsLoRA is on, otherwise None."""
-        if self.kind != "lora" or not self.rslora or self.alpha < 2 * _USUAL_ALPHA:
+        if self.kind != "lora" or not self.rslora or self.alpha < 2 * _DEFAULT_ALPHA:
             return None
-        scale, usual = (alpha / math.sqrt(self.rank) for alpha in (self.alpha, _USUAL_ALPHA))
+        scale, default_scale = (alpha / math.sqrt(self.rank) for alpha in (self.alpha, _DEFAULT_ALPHA))
         return (
-            f"adapter.alpha {self.alpha:g} at rank {self.rank} gives a scale of {scale:.3g}; alpha {_USUAL_ALPHA:g}"
-            f" gives {usual:.3g}. With adapter.rslora use the same alpha at every rank; a larger alpha needs a lower"
-            f" training.learning_rate. Set adapter.alpha={_USUAL_ALPHA:g}, or compare both"
+            f"adapter.alpha {self.alpha:g} at rank {self.rank} gives a scale of {scale:.3g}; alpha {_DEFAULT_ALPHA:g}"
+            f" gives {default_scale:.3g}. With adapter.rslora use the same alpha at every rank; a larger alpha needs a"
+            f" lower training.learning_rate. Set adapter.alpha={_DEFAULT_ALPHA:g}, or compare both"
         )

@@ -24,7 +24,7 @@ from vjepa2_ac.registry import ENERGIES, PLANNERS
 Coordinate = Annotated[float, Field(ge=-5.0, le=5.0)]  # coordinate in the base frame in metres; no arm reaches farther
 Corner = tuple[Coordinate, Coordinate, Coordinate]
 ELITES = 10  # default of the option `elites` of the planners cem and icem
-Metre = ZeroToOne  # no arm moves farther in a model step, so that larger values are probably millimetres
+Metre = ZeroToOne  # no arm moves farther than 1 m in a model step; larger values are probably millimetres
 
 
 class LimitsConfig(Section):
@@ -60,21 +60,21 @@ class LimitsConfig(Section):
         """
         if isinstance(self.xyz, tuple):
             return self.xyz
-        found = "data, for a model or an older run without a record of the motions in its training data"
+        problem = "data, for a model or an older run without a record of the motions in its training data"
         needed = "the largest dx, dy, dz in metres, such as planning.limits.xyz=[0.05,0.05,0.05]"
         fix = "`vjepa2-ac data inspect CONFIG` shows the 99th percentile of the motions in your data (line `axes`)"
-        raise InputError(where="planning.limits.xyz", found=found, needed=needed, fix=fix)
+        raise InputError(where="planning.limits.xyz", found=problem, needed=needed, fix=fix)
 
     @model_validator(mode="after")
     def _workspace_has_room(self) -> LimitsConfig:
         low, high = self.workspace or ((0, 0, 0), (1, 1, 1))
-        is_broken = any(one >= other for one, other in zip(low, high, strict=True))
+        is_broken = any(lowest >= highest for lowest, highest in zip(low, high, strict=True))
         return self.check_rules((is_broken, f"workspace: the corner {low} is not below {high} on every axis"))
 
     @model_validator(mode="after")
     def _something_is_free(self) -> LimitsConfig:
-        held = self.gripper_mode in {"held", "open", "close"} or not self.gripper
-        is_broken = not any(self.xyz) and not self.rotation and held
+        is_gripper_fixed = self.gripper_mode in {"held", "open", "close"} or not self.gripper
+        is_broken = not any(self.xyz) and not self.rotation and is_gripper_fixed
         return self.check_rules((is_broken, "nothing can be planned: xyz, rotation and gripper are all fixed"))
 
 

@@ -16,7 +16,7 @@ class RemovedKey(NamedTuple):
     """What replaces a removed config key."""
 
     always: str
-    """The behaviour of every run now, as the end of the sentence "it is always ..."."""
+    """The behaviour in this version, as the end of the sentence "it is always ..."."""
     values: tuple[Any, ...]
     """The values in older configs that had the same meaning; a section is a dict."""
 
@@ -73,7 +73,7 @@ REMOVED: dict[str, RemovedKey] = {
     "tracking.project": RemovedKey("vjepa2-ac, or the environment variable WANDB_PROJECT", ("vjepa2-ac",)),
     "checkpoint.every_minutes": RemovedKey("15", (15.0,)),
 }
-"""Removed keys and sections, by their dotted key. A row for a key of `data` also holds below `replay`."""
+"""Removed keys and sections, by their dotted key. An entry for a key of `data` also applies to `replay.data`."""
 
 
 MOVED = {
@@ -89,7 +89,7 @@ MOVED = {
     "training.loss_options": "training.loss: {name: NAME, options: {...}}",
     "training.smooth_l1_beta": "training.loss: {name: smooth_l1, options: {beta: 1.0}}",
 }
-"""Removed keys and sections -> where their values are today; most are options of a component."""
+"""Removed keys and sections -> the keys that replace them, most of which are options of a component."""
 
 
 def explain_removed_key(key: str) -> str | None:
@@ -102,7 +102,7 @@ def explain_removed_key(key: str) -> str | None:
 
 @cache
 def _warn(text: str, *values: object) -> None:
-    """Log a warning once: a command reads the config of its run several times."""
+    """Log a warning only once, because a command reads the config of its run several times."""
     logger.warning(text, *values)
 
 
@@ -130,8 +130,8 @@ def drop_removed_keys(values: dict[str, Any], where: str) -> None:
 def move_norm_limit(values: dict[str, Any], where: str) -> None:
     """Replace the norm ball of the limits in the config of an older run by a limit of the L1 norm, in place.
 
-    The L1 norm of a motion is at least its length. So the limit that replaces a ball of the L2 norm is never looser,
-    and is reported as a warning.
+    The L1 norm of a motion is at least its length, so that a limit of the L1 norm is never looser than the same limit
+    of the L2 norm. The replacement of an L2 ball is reported as a warning.
 
     Args:
         values: The plain values of the config.
@@ -159,34 +159,35 @@ def move_component_options(values: dict[str, Any], where: str) -> None:
         values: The plain values of the config.
         where: The file, for the warning.
     """
-    places = (
+    components = (  # section, key, default name
         (("planning",), "planner", "cem"),
         (("planning", "energy"), "distance", "l1"),
         (("training",), "loss", "l1"),
     )
-    for sections, key, usual in places:
+    for sections, key, default in components:
         section: Any = values
         for part in sections:
             section = section.get(part) if isinstance(section, dict) else None
-        component = section.get(key, usual) if isinstance(section, dict) else None
+        component = section.get(key, default) if isinstance(section, dict) else None
         component = {"name": component} if isinstance(component, str) else component
         if not isinstance(component, dict):
-            continue  # an error that validation reports
-        name = component.get("name", usual)
+            continue  # validation reports this error later
+        name = component.get("name", default)
         if not isinstance(name, str):
-            continue  # an error that validation reports
-        older = {one: section.pop(one, None) for one in _OLDER_OPTIONS[key]}
+            continue  # validation reports this error later
+        older = {option: section.pop(option, None) for option in _OLDER_OPTIONS[key]}
         if name == "smooth_l1" and "smooth_l1_beta" in older:
             older[name] = {"beta": older["smooth_l1_beta"]}
         if (start_std := older.get("start_std")) not in (None, 1.0):
             if name in {"cem", "icem", "mppi"}:
-                of_planner = older.get(name)
-                older[name] = {**(of_planner if isinstance(of_planner, dict) else {}), "start_std": start_std}
-            elif name != "prior":  # which draws no samples
+                planner_options = older.get(name)
+                older[name] = {**(planner_options if isinstance(planner_options, dict) else {}), "start_std": start_std}
+            elif name != "prior":  # the planner prior draws no samples
                 text = "%s: planning.start_std was %s; the planner %s has no such option, and uses 1"
                 _warn(text, where, str(start_std), name)
-        given = (older.get(name), older.get(f"{key}_options"), older.get("options"), component.get("options"))
-        options = {option: one[option] for one in given if isinstance(one, dict) for option in one}
+        # Later sources override earlier ones.
+        sources = (older.get(name), older.get(f"{key}_options"), older.get("options"), component.get("options"))
+        options = {option: source[option] for source in sources if isinstance(source, dict) for option in source}
         section[key] = {**component, "options": options} if options else component
 
 

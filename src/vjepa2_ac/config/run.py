@@ -11,7 +11,7 @@ from vjepa2_ac.config.data import DataConfig, source_of
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.config.section import Affects, Section
-from vjepa2_ac.config.sources import RldsData  # noqa: F401 - all forms of data
+from vjepa2_ac.config.sources import RldsData  # noqa: F401 - registers all data formats
 from vjepa2_ac.config.training import CheckpointConfig, DecoderConfig, TrackingConfig, TrainingConfig, ValidationConfig
 from vjepa2_ac.storage import paths
 
@@ -28,7 +28,7 @@ def _run_folder(path: str) -> str:
 class ReplayConfig(Section):
     """A second data set whose clips are mixed into training to reduce forgetting.
 
-    It is for example the training data of the base model, or data with diverse motion. Validation, evaluation and
+    Use for example the training data of the base model, or data with diverse motion. Validation, evaluation and
     planning use the first data set only.
     """
 
@@ -40,11 +40,13 @@ class ReplayConfig(Section):
     latent cache must be the same as in `data`. Only the training split is used; `workers` is ignored."""
 
     def find_mismatches(self, first: DataConfig) -> list[str]:
-        """Return why clips of both data sets cannot be in one micro-batch, as far as their configs show."""
+        """Return why clips of both data sets cannot be in one micro-batch, according to the two configs."""
         same = ("frames", "states", "actions", "join_actions", "pose_frame")
         pairs = [(name, getattr(self.data, name), getattr(first, name)) for name in same]
         lines = [
-            f"replay.data.{name} {one} differs from data.{name} {other}" for name, one, other in pairs if one != other
+            f"replay.data.{name} {second} differs from data.{name} {value}"
+            for name, second, value in pairs
+            if second != value
         ]
         if self.data.uses_cached_latents != first.uses_cached_latents:
             lines.append("only one of data and replay.data uses cached latents. Set the same value of cache in both")
@@ -59,7 +61,7 @@ class Config(Section):
     """A complete run."""
 
     run_dir: Annotated[str, AfterValidator(_run_folder), Affects.NOTHING]
-    """LocalPath folder of the run: resolved config, checkpoints, metrics. `checkpoint.remote` keeps a copy."""
+    """Local folder of the run: resolved config, checkpoints, metrics. `checkpoint.remote` keeps a copy."""
     seed: Annotated[int, Field(ge=0, lt=2**31), Affects.RUN | Affects.PLAN] = 0
     """Seed of the order of clips, new weights, dropout and the planner's samples."""
     plugins: Annotated[tuple[str, ...], Affects.NOTHING] = ()
@@ -103,12 +105,13 @@ class Config(Section):
         training, adapter, model, best = self.training, self.adapter, self.model, self.checkpoint.keep_best
         predictor, steps, lora = model.sizes.predictor, training.rollout_steps, adapter.kind == "lora"
         graph, fp32, compiled = training.cuda_graph, training.precision == "fp32", training.compile != "off" and lora
-        draws_or_scales = training.precision == "fp16" or adapter.dropout > 0  # a graph would repeat masks and scale
-        patient, ranked = training.patience is not None, self.validation.ranking_clips > 0
-        stray = [name for name in ("targets", "modules_to_save") if "state_encoder" in getattr(adapter, name)]
-        stray = stray if lora and not predictor.use_states else []
-        blind = [data.source for data in self.data_sets if not data.has_camera_poses]
-        find_mismatches = [] if self.replay is None else self.replay.find_mismatches(self.data)
+        # A CUDA graph would repeat the same dropout masks, and the same loss scale of fp16.
+        draws_or_scales = training.precision == "fp16" or adapter.dropout > 0
+        has_patience, is_ranked = training.patience is not None, self.validation.ranking_clips > 0
+        unusable = [name for name in ("targets", "modules_to_save") if "state_encoder" in getattr(adapter, name)]
+        unusable = unusable if lora and not predictor.use_states else []
+        without_cameras = [data.source for data in self.data_sets if not data.has_camera_poses]
+        mismatches = [] if self.replay is None else self.replay.find_mismatches(self.data)
         return self.check_rules(
             (steps >= self.data.frames, f"training.rollout_steps {steps} needs data.frames of at least {steps + 1}"),
             (
@@ -118,14 +121,17 @@ class Config(Section):
             (fp32 and model.dtype != "float32", "training.precision fp32 needs model.dtype float32"),
             (compiled and adapter.dora, "training.compile: blocks does not support adapter.dora. Turn one of them off"),
             (graph and draws_or_scales, "training.cuda_graph needs adapter.dropout 0, and bf16 or fp32"),
-            (best == "ranking" and not ranked, "checkpoint.keep_best ranking needs validation.ranking_clips"),
+            (best == "ranking" and not is_ranked, "checkpoint.keep_best ranking needs validation.ranking_clips"),
             (
-                best == "off" and patient,
+                best == "off" and has_patience,
                 "training.patience needs checkpoint.keep_best: ranking or error, and it is off",
             ),
-            (predictor.use_extrinsics and blind, f"predictor.use_extrinsics needs camera poses, not in source {blind}"),
-            (stray, f"adapter.{' and '.join(stray)}: with predictor.use_states: false there is no state_encoder"),
-            (find_mismatches, "; ".join(find_mismatches)),
+            (
+                predictor.use_extrinsics and without_cameras,
+                f"predictor.use_extrinsics needs camera poses, not in source {without_cameras}",
+            ),
+            (unusable, f"adapter.{' and '.join(unusable)}: with predictor.use_states: false there is no state_encoder"),
+            (mismatches, "; ".join(mismatches)),
         )
 
     @property
@@ -144,7 +150,7 @@ class Config(Section):
             ValueError: There is no replay data set.
         """
         if self.replay is None:
-            raise ValueError("a config without replay")
+            raise ValueError("the config has no replay data set")
         return self.model_copy(update={"data": self.replay.data, "replay": None})
 
 
@@ -176,10 +182,12 @@ def _differences(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str
     """Return the values that differ from `base`, also within sections: the inverse of `_merged`."""
     differing = {}
     for key, value in values.items():
-        before = base.get(key)
-        if isinstance(value, dict) and isinstance(before, dict):
-            if inner := {name: one for name, one in value.items() if name not in before or one != before[name]}:
+        base_value = base.get(key)
+        if isinstance(value, dict) and isinstance(base_value, dict):
+            if inner := {
+                name: item for name, item in value.items() if name not in base_value or item != base_value[name]
+            }:
                 differing[key] = inner
-        elif key not in base or value != before:
+        elif key not in base or value != base_value:
             differing[key] = value
     return differing

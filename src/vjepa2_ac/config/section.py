@@ -1,7 +1,7 @@
-"""Base class of config sections, annotations that say what each key affects, and components with options.
+"""Base class of config sections, annotations of what each config key affects, and components with options.
 
-A section is annotated as a whole: by `Section.affects`, or by `Annotated[…, Affects.RUN]` where the section is used. A
-key that differs from its section has an annotation in addition.
+A section is annotated as a whole: with `Section.affects`, or with `Annotated[…, Affects.RUN]` where it is used as a
+key. A key that affects something else than its section has its own annotation.
 
 A component is configured by its name and, if needed, its options: `planner: icem`, or
 `planner: {name: icem, options: {elites: 20}}`.
@@ -48,7 +48,7 @@ class Affects(Flag):
 class Section(BaseModel):
     """A group of config keys: frozen, and unknown keys are errors."""
 
-    affects: ClassVar[Affects | None] = None  # for keys without an annotation; None: as the outer section
+    affects: ClassVar[Affects | None] = None  # for keys without an annotation; None: the same as the outer section
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -61,11 +61,11 @@ class Section(BaseModel):
             rules: Pairs (is_broken, message).
 
         Raises:
-            ValueError: A rule is broken; has the message of the first one.
+            ValueError: A rule is broken; the message is that of the first broken rule.
         """
-        for is_broken, why in rules:
+        for is_broken, message in rules:
             if is_broken:
-                raise ValueError(why)
+                raise ValueError(message)
         return self
 
 
@@ -84,71 +84,70 @@ def collect_effects(section: type[BaseModel]) -> Mapping[str, Affects]:
 
 @cache
 def get_effect(key: str, section: type[BaseModel]) -> Affects:
-    """Return what a key affects; for a part of a value, such as data.fields.cameras.left, what the whole key affects.
+    """Return what a key affects.
 
-    For a section the annotations of its keys are combined. The keys of `replay.data` are those of `data`, but affect
-    the run only.
+    For a part of a value, such as data.fields.cameras.left, this is what the key affects. For a section the annotations
+    of its keys are combined. The keys of `replay.data` are the same as those of `data`, but affect the run only.
 
     Raises:
         KeyError: There is no such key.
     """
-    if (of_data := to_data_key(key)) != key:
-        return get_effect(of_data, section) & Affects.RUN
-    known = ((f"{name}.", mark) for name, mark in collect_effects(section).items())
-    marks = [mark for name, mark in known if name.startswith(f"{key}.") or f"{key}.".startswith(name)]
-    if not marks:
+    if (data_key := to_data_key(key)) != key:
+        return get_effect(data_key, section) & Affects.RUN
+    effects = ((f"{name}.", effect) for name, effect in collect_effects(section).items())
+    matching = [effect for name, effect in effects if name.startswith(f"{key}.") or f"{key}.".startswith(name)]
+    if not matching:
         raise KeyError(key)
-    return reduce(or_, marks)
+    return reduce(or_, matching)
 
 
 def to_data_key(key: str) -> str:
-    """Return the key of `data` that a key of `replay.data` overlays; any other key is returned unchanged."""
+    """Return the key of `data` that a key of `replay.data` overrides; any other key is returned unchanged."""
     return f"data.{key.removeprefix(f'{REPLAY_DATA}.')}" if key.startswith(f"{REPLAY_DATA}.") else key
 
 
-def values_that_affect(what: Affects, section: BaseModel) -> dict[str, Any]:
-    """Return the values of the keys of a section that affect any of `what`, as nested plain values.
+def values_that_affect(effects: Affects, section: BaseModel) -> dict[str, Any]:
+    """Return the values of the keys that affect any of `effects`, as nested plain values.
 
     Raises:
         TypeError: A key has no annotation.
     """
     plain: dict[str, Any] = section.model_dump(mode="json")
-    chosen: dict[str, Any] = {}
-    for key, mark in collect_effects(type(section)).items():
+    selected: dict[str, Any] = {}
+    for key, effect in collect_effects(type(section)).items():
         *outer, name = key.split(".")
-        values, target = plain, chosen
+        values, target = plain, selected
         for part in outer:
             values = values.get(part) or {}
-        if what & mark and name in values:
+        if effects & effect and name in values:
             for part in outer:
                 target = target.setdefault(part, {})
             target[name] = values[name]
-    return chosen
+    return selected
 
 
 def _iterate_effects(section: type[BaseModel], outer: Affects | None, prefix: str) -> Iterator[tuple[str, Affects]]:
     for name, info in section.model_fields.items():
-        mark = next((one for one in info.metadata if isinstance(one, Affects)), None)
-        inner = [] if prefix + name == REPLAY_DATA else sections_in(info.annotation)
-        for one in (kind for base in inner for kind in [*getattr(base, "kinds", {}).values()] or [base]):
-            marks = (mark, getattr(one, "affects", None), outer)
-            yield from _iterate_effects(
-                one, next((known for known in marks if known is not None), None), f"{prefix}{name}."
-            )
+        annotation = next((entry for entry in info.metadata if isinstance(entry, Affects)), None)
+        inner = [] if prefix + name == REPLAY_DATA else find_sections(info.annotation)
+        for kind in (kind for base in inner for kind in [*getattr(base, "kinds", {}).values()] or [base]):
+            candidates = (annotation, getattr(kind, "affects", None), outer)
+            effect = next((candidate for candidate in candidates if candidate is not None), None)
+            yield from _iterate_effects(kind, effect, f"{prefix}{name}.")
         if not inner:
-            mark = outer if mark is None else mark
-            if mark is None:
+            effect = outer if annotation is None else annotation
+            if effect is None:
                 raise TypeError(
                     f"{prefix}{name}: not annotated with what it affects, as in Annotated[int, Affects.RUN]"
                 )
-            yield prefix + name, mark
+            yield prefix + name, effect
 
 
-def sections_in(annotation: Any) -> list[type[BaseModel]]:
+def find_sections(annotation: Any) -> list[type[BaseModel]]:
     """Return the sections that occur in a type annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [section for one in get_args(annotation) for section in sections_in(one)]
+    return [section for argument in get_args(annotation) for section in find_sections(argument)]
 
 
 # ---- components ----
@@ -158,7 +157,7 @@ _FORMS = "a name, or {name: NAME, options: {...}}"
 
 @dataclass(frozen=True)
 class Component:
-    """The name of a component in its registry, and those of its options that are not the defaults."""
+    """The name of a component in its registry, and the options that differ from the defaults."""
 
     name: str
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -176,11 +175,11 @@ class ComponentOf:
 
     Args:
         registry: The registry of the components.
-        usual: The name to use if only options are given.
+        default: The name to use if only options are given.
     """
 
     registry: Registry
-    usual: str | None = None
+    default: str | None = None
 
     def read(self, value: object) -> Component:
         """Parse a config value.
@@ -191,7 +190,7 @@ class ComponentOf:
         values = value.plain() if isinstance(value, Component) else value
         values = {"name": values} if isinstance(values, str) else values
         form = values if isinstance(values, Mapping) else {}
-        name, options = form.get("name", self.usual), form.get("options", {})
+        name, options = form.get("name", self.default), form.get("options", {})
         is_known = bool(form) and form.keys() <= {"name", "options"}
         if not is_known or not isinstance(name, str) or not isinstance(options, Mapping):
             raise ValueError(f"{_FORMS} is expected")
@@ -209,7 +208,7 @@ class ComponentOf:
             {
                 "type": "object",
                 "properties": {"name": {"const": name}, "options": section.model_json_schema()},
-                "required": ["options"] if name == self.usual else ["name"],
+                "required": ["options"] if name == self.default else ["name"],
                 "additionalProperties": False,
             }
             for name in names

@@ -9,9 +9,8 @@ from pydantic import Field
 from vjepa2_ac.config.data import DataConfig, PoseFields
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
-RAW_RATE_HZ = (
-    15.0  # control steps per second of raw DROID; its MP4s have one frame per step, whatever their header says
-)
+# Control steps per second of raw DROID. Its MP4s have one frame per step, also if their header has another rate.
+RAW_RATE_HZ = 15.0
 JOINT_VELOCITY = "action.joint_velocity"  # LeRobot's column of commanded joint velocities, read by the idle filter
 
 RECORD: Literal["record"] = "record"  # a value of `identity`

@@ -152,7 +152,7 @@ class TrackingConfig(Section):
     """Your trackers (docs/extending.md): name -> options, {} for none."""
 
     @model_validator(mode="after")
-    def _others_are_known(self) -> TrackingConfig:
+    def _trackers_are_registered(self) -> TrackingConfig:
         for name, options in self.others.items():
             TRACKERS.options(TRACKERS.require_registered(name), options, at=("others", name))
         return self
