@@ -207,7 +207,7 @@ ENERGIES = Registry(
     {
         "l1": "planning.energy:mean_difference",
         "l2": "planning.energy:mean_square",
-        "cosine": "planning.energy:one_minus_cosine",
+        "cosine": "planning.energy:cosine_distance",
     },
 )
 METRICS = Registry("metric", "vjepa2_ac.metrics", {"l1": "evaluation.result:L1", "l2": "evaluation.result:L2"})

@@ -232,13 +232,15 @@ class StateSpace(Space):
             if is_wrong.any():
                 step = int(is_wrong.argmax())
                 position = f"{where}: step {step}" if len(states) > 1 else where
-                found = f"the numbers {np.array2string(states[step], precision=4, max_line_width=200)}"
+                problem = f"the numbers {np.array2string(states[step], precision=4, max_line_width=200)}"
                 looks = [
                     f"The {part} look like {unit}: {conversions[unit]}"
                     for part, unit in self._likely_units(states)
                     if unit in conversions
                 ]
-                raise InputError(where=position, found=found, needed=needed, fix=". ".join(filter(None, [*looks, fix])))
+                raise InputError(
+                    where=position, found=problem, needed=needed, fix=". ".join(filter(None, [*looks, fix]))
+                )
 
     def require_state(self, numbers: np.ndarray, where: str) -> None:
         """Refuse an array that is not a state, or an implausible state.
@@ -248,8 +250,8 @@ class StateSpace(Space):
         """
         if numbers.shape != (len(self),):
             names = (f"{name} ({unit})" if unit else name for name, unit in zip(self.names, self.units, strict=True))
-            found = f"{numbers.size} numbers with shape {numbers.shape}"
-            raise InputError(where=where, found=found, needed=f"{len(self)}: {', '.join(names)}")
+            problem = f"{numbers.size} numbers with shape {numbers.shape}"
+            raise InputError(where=where, found=problem, needed=f"{len(self)}: {', '.join(names)}")
         self.require_plausible(numbers[None], where)
 
     def _checks(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[np.ndarray, str]]:

@@ -103,7 +103,7 @@ def starts(dataset: Dataset) -> set[tuple[int, int]]:
 
 def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
     dataset = open_with(source_with_rests(), idle=MOTION)
-    assert [dataset.kept_steps.ranges_of(episode) for episode in range(3)] == [
+    assert [dataset.selected_steps.ranges_of(episode) for episode in range(3)] == [
         ((0, 10), (35, 50)),
         ((0, 10),),
         ((0, 10), (35, 70)),
@@ -111,7 +111,7 @@ def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
     assert starts(dataset) == {
         (episode, start)
         for episode in range(3)
-        for first, end in dataset.kept_steps.ranges_of(episode)
+        for first, end in dataset.selected_steps.ranges_of(episode)
         for start in range(first, end - 4)
     }
     removed = {one.name: one for one in dataset.removed}["idle"]
@@ -121,8 +121,8 @@ def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
 
 def test_idle_ranges_are_computed_once(open_with: Any) -> None:
     first, second, third = source_with_rests(), source_with_rests(), source_with_rests()
-    kept = open_with(first, idle=MOTION).kept_steps
-    again = open_with(second, idle=MOTION, exclude=("episode 1",), stride=3).kept_steps
+    kept = open_with(first, idle=MOTION).selected_steps
+    again = open_with(second, idle=MOTION, exclude=("episode 1",), stride=3).selected_steps
     assert [index for index, *_ in first.reads] == [0, 1, 2]
     assert second.reads == []
     assert again.ranges_of(2) == kept.ranges_of(2)
@@ -163,14 +163,14 @@ def test_published_ranges_are_matched_by_identity(open_with: Any, tmp_path: Path
     ranges = {"episode 1": [[0, 12], [20, 40]], "elsewhere": [[0, 9999]], "episode 2": []}
     source = source_with_rests()
     dataset = open_with(source, **published(tmp_path, ranges))
-    assert [dataset.kept_steps.ranges_of(episode) for episode in range(3)] == [(), ((0, 12), (20, 40)), ()]
+    assert [dataset.selected_steps.ranges_of(episode) for episode in range(3)] == [(), ((0, 12), (20, 40)), ()]
     assert "lists 2 of the 3 episodes; the other 1 are treated as idle" in caplog.text
     assert source.reads == []
     assert starts(dataset) == {(1, start) for start in (*range(8), *range(20, 36))}
     other = open_with(source, **published(tmp_path, {"episode 1": [[0, 13]]}))
-    assert other.kept_steps.ranges_of(1) == ((0, 13),), "a changed list is read anew"
+    assert other.selected_steps.ranges_of(1) == ((0, 13),), "a changed list is read anew"
     url = gcs.put("robots/ranges.json", json.dumps({"episode 1": [[0, 13]]}).encode())
-    assert open_with(source, idle=IdleConfig(rule="published", ranges=url)).kept_steps.ranges_of(1) == ((0, 13),)
+    assert open_with(source, idle=IdleConfig(rule="published", ranges=url)).selected_steps.ranges_of(1) == ((0, 13),)
     with pytest.raises(InputError, match=r"nowhere\.json: cannot be read"):
         open_with(source, idle=IdleConfig(rule="published", ranges=str(tmp_path / "nowhere.json")))
 

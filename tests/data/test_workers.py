@@ -108,7 +108,7 @@ def test_slow_batch_is_awaited_unless_a_stop_signal_arrived(monkeypatch: pytest.
         loader._next_row(Slow("another"), ())
     stop = StopRequest()
     stop.record(signal.SIGTERM, None)
-    stop._came_at -= 100.0
+    stop._received_at -= 100.0
     monkeypatch.setattr(loader, "stop_request", lambda: stop)
     assert loader._next_row(Slow(), ()) == 7, "only a wait after the signal counts"
     monkeypatch.setattr(loader, "_GRACE_S", 0.0)

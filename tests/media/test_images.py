@@ -83,8 +83,12 @@ def test_huge_image_raises_before_decoding(size: tuple[int, int], monkeypatch: p
         lambda: jpeg.decode_images([claimed_jpeg(*size)], [5], "goal"),
     ]
     for decode in huge:
-        with pytest.raises(InputError, match=f"goal.*: 1 images of {size[0]} x {size[1]} pixels.*100 megapixels"):
+        with pytest.raises(InputError, match=f"goal.*: 1 image of {size[0]} x {size[1]} pixels.*100 megapixels"):
             decode()
+
+
+def test_decoding_no_images_returns_an_empty_array() -> None:
+    assert jpeg.decode_images([], [], "goal").shape == (0, 0, 0, 3)
 
 
 FORMS = ("rlds", "lerobot videos", "lerobot images", "npz")

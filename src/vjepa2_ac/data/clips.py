@@ -141,9 +141,9 @@ def collate(clips: Sequence[Clip]) -> Batch:
     ]
     if other := next((pair for pair in sizes if pair[0] != sizes[0][0]), None):
         (size, first), (other_size, name) = sizes[0], other
-        found = f"frames of {other_size} pixels after the crop, but those of episode {first} have {size}"
+        problem = f"frames of {other_size} pixels after the crop, but those of episode {first} have {size}"
         fix = "Train on episodes of one size, or set training.batch_size: 1"
-        raise add_exclusion_fix(InputError(where=f"episode {name}", found=found, fix=fix), [name])
+        raise add_exclusion_fix(InputError(where=f"episode {name}", found=problem, fix=fix), [name])
     latents = [clip.latents for clip in clips if clip.latents is not None]
     extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
     return Batch(

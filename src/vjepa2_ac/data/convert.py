@@ -63,8 +63,10 @@ def convert_to_lerobot(config: DataConfig, folder: Path, reporter: Reporter) -> 
         UnreachableError: pyarrow or PyAV is not installed.
     """
     require_frames(config, to="write its frames")
-    if wrong := [camera for camera in config.cameras if "/" in camera]:
-        raise InputError(where="data.camera", found=repr(wrong[0]), needed="a name without /, as LeRobot requires")
+    if unsupported := [camera for camera in config.cameras if "/" in camera]:
+        raise InputError(
+            where="data.camera", found=repr(unsupported[0]), needed="a name without /, as LeRobot requires"
+        )
     dataset = open_dataset(config.model_copy(update={"idle": IdleConfig()}), progress=reporter.task(INDEXING))
     episodes = np.flatnonzero(dataset.is_selected).tolist()
     is_known = dataset.table.success[episodes] >= 0
@@ -176,11 +178,10 @@ class LeRobotWriter:
             raise
         rows = {name: self._column(values) for name, values in columns.items()}
         self._append(fill_template(self._template["info"]["data_path"], 0, 0), rows)
-        for name, new in statistics.items():
-            row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in new.items()}
-            self._statistics[name] = (
-                combine_statistics(self._statistics[name], new) if name in self._statistics else new
-            )
+        for name, added in statistics.items():
+            row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in added.items()}
+            earlier = self._statistics.get(name)
+            self._statistics[name] = added if earlier is None else combine_statistics(earlier, added)
         self._rows.append(row | _file_indices("meta/episodes", 0, 0))
         self._tasks.setdefault(task, len(self._tasks))
         self.num_episodes, self.num_steps = number + 1, start + steps
@@ -208,10 +209,10 @@ class LeRobotWriter:
         """Write the video of a camera; return statistics of a sample of its pixels, scaled to 0 .. 1."""
         sample: list[UInt8[np.ndarray, "height width 3"]] = []
 
-        def sampled() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+        def frames_with_sampling() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
             for step, frame in enumerate(frames):
                 height, width = (size // 2 * 2 for size in frame.shape[:2])
-                first_shape = self._features.setdefault(key, self._camera(height, width))["shape"]
+                first_shape = self._features.setdefault(key, self._describe_camera(height, width))["shape"]
                 if first_shape[:2] != [height, width]:
                     needed = f"{first_shape[0]}x{first_shape[1]}, as in the first episode"
                     fix = "Convert recordings of different cameras to different data sets"
@@ -221,13 +222,15 @@ class LeRobotWriter:
                     sample.append(frame[:height:every, :width:every])
                 yield frame
 
-        write_video(path, sampled(), rate_hz=float(self._rate_hz), crf=_CRF, key_frame_every=_KEY_FRAME_EVERY)
+        write_video(
+            path, frames_with_sampling(), rate_hz=float(self._rate_hz), crf=_CRF, key_frame_every=_KEY_FRAME_EVERY
+        )
         pixel_statistics = compute_statistics(np.stack(sample).reshape(-1, 3) / 255) | {
             "count": np.array([len(sample)])
         }
         return {name: value if name == "count" else value.reshape(3, 1, 1) for name, value in pixel_statistics.items()}
 
-    def _camera(self, height: int, width: int) -> dict[str, Any]:
+    def _describe_camera(self, height: int, width: int) -> dict[str, Any]:
         sizes = {"video.height": height, "video.width": width, "video.fps": self._rate_hz}
         shape, names = [height, width, 3], ["height", "width", "channels"]
         return {"dtype": "video", "shape": shape, "names": names, "info": self._template["camera"] | sizes}
@@ -259,13 +262,13 @@ def compute_statistics(values: Shaped[np.ndarray, "steps numbers"]) -> Statistic
     return {"min": values.min(axis=0), "max": values.max(axis=0), **moments, **quantiles}
 
 
-def combine_statistics(known: Statistics, new: Statistics) -> Statistics:
+def combine_statistics(first: Statistics, second: Statistics) -> Statistics:
     """Combine the statistics of two sets of steps; quantiles are averaged with weights, as in LeRobot."""
-    share = new["count"] / (known["count"] + new["count"])
-    averages = {name: known[name] + (new[name] - known[name]) * share for name in ("mean", *_QUANTILES)}
-    variances = [part["std"] ** 2 + (part["mean"] - averages["mean"]) ** 2 for part in (known, new)]
-    std, count = np.sqrt(variances[0] * (1 - share) + variances[1] * share), known["count"] + new["count"]
-    extremes = {"min": np.minimum(known["min"], new["min"]), "max": np.maximum(known["max"], new["max"])}
+    share = second["count"] / (first["count"] + second["count"])
+    averages = {name: first[name] + (second[name] - first[name]) * share for name in ("mean", *_QUANTILES)}
+    variances = [part["std"] ** 2 + (part["mean"] - averages["mean"]) ** 2 for part in (first, second)]
+    std, count = np.sqrt(variances[0] * (1 - share) + variances[1] * share), first["count"] + second["count"]
+    extremes = {"min": np.minimum(first["min"], second["min"]), "max": np.maximum(first["max"], second["max"])}
     return {**extremes, "std": std, "count": count, **averages}
 
 

@@ -62,15 +62,15 @@ class Dataset:
     config: DataConfig
     source: EpisodeSource  # a LatentSource if the data are a latent cache
     table: EpisodeTable
-    kept_steps: StepSelection
-    broken: BrokenEpisodes  # grows in the process that opened the data set
+    selected_steps: StepSelection
+    broken: BrokenEpisodes  # broken episodes are recorded in the process that opened the data set
     groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each episode's group; None without `data.split_by`
 
     @cached_property
     def is_selected(self) -> Bool[np.ndarray, " episodes"]:
         """A mask of the episodes that are used; the idle filter may still remove all steps of such an episode."""
         selected = np.asarray(select_included(self.table, self.config) & select_outcome(self.table, self.config))
-        selected[[index for index, _ in self.kept_steps.problems]] = False
+        selected[[index for index, _ in self.selected_steps.problems]] = False
         return selected
 
     @property
@@ -128,10 +128,10 @@ class Dataset:
         require_stride(self.config, to="read clips", fix="Pass a stride: open_dataset(config, stride=4)")
         members = self.split_mask(split)
         if not members.any():
-            raise self._empty_split(split)
+            raise self._empty_split_error(split)
         return select_split_windows(self.table, members, self.starts, self.config, split)
 
-    def _empty_split(self, split: Split) -> InputError:
+    def _empty_split_error(self, split: Split) -> InputError:
         config, is_selected = self.config, self.is_selected
         groups = None if config.split_by is None else len(np.unique(self.split_hash[is_selected]))
         together = "" if groups is None else f" in {groups} groups (data.split_by)"
@@ -139,8 +139,8 @@ class Dataset:
         fix = "Lower data.validation_share or data.test_share" if split == "train" else f"Raise data.{split}_share"
         if split in held_out_splits(self.table, config):
             fix = "Set data.splits: hash to draw the splits from all episodes"
-        found = f"no {split} episodes among {is_selected.sum()}{together} ({shares})"
-        return InputError(where=f"data.path: {config.path}", found=found, fix=fix)
+        problem = f"no {split} episodes among {is_selected.sum()}{together} ({shares})"
+        return InputError(where=f"data.path: {config.path}", found=problem, fix=fix)
 
     def with_frames(self, frames: int) -> Dataset:
         """Return the data set with clips of another length; clips of a latent cache must need the same frames."""
@@ -153,9 +153,9 @@ class Dataset:
             InputError: The data are a latent cache, which has the frames of one stride only.
         """
         if self.config.is_cache and stride != self.config.stride:
-            found = f"latents for clips at stride {self.config.stride}, not {stride}"
+            problem = f"latents for clips at stride {self.config.stride}, not {stride}"
             fix = "Use the data set itself, with data.cache: off"
-            raise InputError(where=self.config.path, found=found, fix=fix)
+            raise InputError(where=self.config.path, found=problem, fix=fix)
         return replace(self, config=self.config.with_stride(stride))
 
     @cached_property
@@ -165,7 +165,7 @@ class Dataset:
         selected = not_excluded & select_outcome(self.table, self.config)
         masks = np.ones(len(self.table), bool), not_excluded, selected, self.is_selected
         left = [self._count(StepSelection.all_steps(self.table, mask)) for mask in masks]
-        removed = -np.diff([*left, self._count(self.kept_steps)], axis=0)
+        removed = -np.diff([*left, self._count(self.selected_steps)], axis=0)
         excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
         unread = {"excluded": excluded, "outcome": 0, "broken": len(self.table.problems) - excluded, "idle": 0}
         is_known = self.config.stride != "auto"
@@ -174,16 +174,16 @@ class Dataset:
             for name, (episodes, steps, windows) in zip(unread, removed.tolist(), strict=True)
         )
 
-    def _count(self, kept: StepSelection) -> tuple[int, int, int]:
+    def _count(self, steps: StepSelection) -> tuple[int, int, int]:
         """Return the numbers of episodes, steps and windows (0 if the stride is unknown)."""
         is_known = self.config.stride != "auto"
-        windows = len(find_clip_windows(self.table, kept, self.config)) if is_known else 0
-        return len(np.unique(kept.episode)), kept.num_steps, windows
+        windows = len(find_clip_windows(self.table, steps, self.config)) if is_known else 0
+        return len(np.unique(steps.episode)), steps.num_steps, windows
 
     @property
     def episodes(self) -> Int[np.ndarray, " episodes"]:
         """The indices of the episodes that clips may come from."""
-        return np.unique(self.kept_steps.episode)
+        return np.unique(self.selected_steps.episode)
 
     @cached_property
     def starts(self) -> Windows:
@@ -192,7 +192,7 @@ class Dataset:
         Raises:
             ValueError: The stride is not yet calibrated.
         """
-        return find_clip_windows(self.table, self.kept_steps, self.config)
+        return find_clip_windows(self.table, self.selected_steps, self.config)
 
     @cached_property
     def control_rate_hz(self) -> float:
@@ -244,7 +244,7 @@ class Dataset:
 
     def needed_steps(self, episode: int) -> StepRanges | None:
         """Return the steps of an episode that clips may come from; None: all of them."""
-        return None if self.config.idle.rule == "none" else self.kept_steps.ranges_of(episode)
+        return None if self.config.idle.rule == "none" else self.selected_steps.ranges_of(episode)
 
 
 def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dataset:
@@ -266,21 +266,21 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     selected &= select_outcome(table, config)
     broken = BrokenEpisodes(config, len(table) + len(table.problems), table.id_hash[selected])
     broken.record_problems([problem for problem in table.problems if problem.name not in config.exclude])
-    kept = StepSelection.all_steps(table, selected)
+    steps = StepSelection.all_steps(table, selected)
     if config.idle.rule != "none":
         ranges = source.read_selected_steps() if config.is_cache else find_ranges(source, table, config, progress)
         broken.record_problems([problem for index, problem in ranges.problems if selected[index]])
-        kept = ranges.select_episodes(selected)
-    dataset = Dataset(config, source, table, kept, broken)
+        steps = ranges.select_episodes(selected)
+    dataset = Dataset(config, source, table, steps, broken)
     dataset = replace(dataset, groups=hash_groups(table, dataset.is_selected, config))
     if not len(dataset.episodes):
         filters = ", ".join(f"{removed.name} {removed.episodes}" for removed in dataset.removed if removed.episodes)
         left_out = f" (removed: {filters})" if filters else ""
-        found = f"none of {counted(len(table) + len(table.problems), 'episode')} remains{left_out}"
+        text = f"none of {counted(len(table) + len(table.problems), 'episode')} remains{left_out}"
         fix = "Check data.exclude, data.outcome and data.idle" if filters else ""
-        raise InputError(where=f"data.path: {config.path}", found=found, fix=fix)
-    logger.info("%s: using %d episodes with %d steps", config.path, dataset.is_selected.sum(), kept.num_steps)
-    return _settled(dataset)
+        raise InputError(where=f"data.path: {config.path}", found=text, fix=fix)
+    logger.info("%s: using %d episodes with %d steps", config.path, dataset.is_selected.sum(), steps.num_steps)
+    return _resolve_cameras(dataset)
 
 
 def open_cached_latents(dataset: Dataset, folder: Path | str) -> Dataset:
@@ -293,10 +293,10 @@ def open_cached_latents(dataset: Dataset, folder: Path | str) -> Dataset:
     source = open_source(config)
     # The labels are copied, because caches of older versions lack the labels of splits.
     table = replace(EpisodeTable.from_infos(source.infos()), labels=dataset.table.labels)
-    return _settled(replace(dataset, source=source, table=table, config=config))
+    return _resolve_cameras(replace(dataset, source=source, table=table, config=config))
 
 
-def _settled(dataset: Dataset) -> Dataset:
+def _resolve_cameras(dataset: Dataset) -> Dataset:
     """Check that a latent cache has the files of all clips, and set its cameras in the config."""
     source: Any = dataset.source
     return (
@@ -354,10 +354,10 @@ def find_episode(dataset: Dataset, name: str) -> int:
         return int(name)
     matching = [int(index) for index in dataset.episodes if name in table.identity(int(index))]
     if len(matching) != 1:
-        found = f"{counted(len(matching), 'episode')} with this name in {dataset.config.path}"
+        problem = f"{counted(len(matching), 'episode')} with this name in {dataset.config.path}"
         example = table.identity((matching or dataset.episodes.tolist())[0])
-        needed = f"an identity such as {example}, a unique part of one, or an index from 0 to {len(table) - 1}"
-        raise InputError(where=f"--episode {name}", found=found, needed=needed)
+        needed = f"an identity such as {example}, a unique part of an identity, or an index from 0 to {len(table) - 1}"
+        raise InputError(where=f"--episode {name}", found=problem, needed=needed)
     return matching[0]
 
 
@@ -375,7 +375,7 @@ def require_widths(episode: Episode, widths: Widths) -> None:
     """
     actual = get_widths(episode)
     if actual != widths:
-        found = f"states of {actual.state} and actions of {actual.action} numbers"
+        problem = f"states of {actual.state} and actions of {actual.action} numbers"
         needed = f"{widths.state} and {widths.action}, as in the other episodes"
         fix = "Keep the recordings of different robots in different data sets"
-        raise InputError(where=f"episode {episode.info.id}", found=found, needed=needed, fix=fix)
+        raise InputError(where=f"episode {episode.info.id}", found=problem, needed=needed, fix=fix)

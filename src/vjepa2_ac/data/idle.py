@@ -35,14 +35,15 @@ RangesOrProblem = list[tuple[int, int]] | EpisodeProblem
 def find_ranges(
     source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress | None
 ) -> StepSelection:
-    """Return the ranges that `data.idle.rule` keeps, for all episodes, whether they are used or not.
+    """Return the ranges that `data.idle.rule` keeps, for all episodes, including unused ones.
 
     Raises:
-        InputError: The list of ranges cannot be read or belongs to another data set, or the rule fits no episode.
+        InputError: The list of ranges cannot be read or belongs to another data set, or the rule cannot be applied to
+            any of the first episodes.
     """
     values = {"idle": config.idle.model_dump(mode="json"), **config.format_values}
     parts: dict[str, object] = {"found": "idle ranges", "table": compute_fingerprint(table), "data": values}
-    make = partial(_computed, source, table, config, progress or no_progress)
+    make = partial(_compute_ranges, source, table, config, progress or no_progress)
     if config.idle.rule == "published":
         path = str(config.idle.ranges)
         make = partial(published_ranges, path, table)
@@ -51,10 +52,12 @@ def find_ranges(
     return get_or_build(config.disk_cache, hash_key(parts), make, StepSelection)
 
 
-def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress) -> StepSelection:
+def _compute_ranges(
+    source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress
+) -> StepSelection:
     def ranges_of(index: int) -> RangesOrProblem:
         try:
-            return kept_ranges(source.read(index), config.idle)
+            return find_selected_ranges(source.read(index), config.idle)
         except InputError as error:
             return EpisodeProblem.from_error(error, table.identity(index))
 
@@ -83,12 +86,14 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     listed = sum(name in ranges_by_identity for name in names)
     if not listed:
         first = next(iter(ranges_by_identity), "missing")
-        found = f"the list has none of the {counted(len(table), 'episode')} of the data set. Its first entry is {first}"
+        problem = (
+            f"the list has none of the {counted(len(table), 'episode')} of the data set. Its first entry is {first}"
+        )
         needed = "the identities of the episodes" + (f", such as {names[0]}" if names else "")
-        raise InputError(where=where, found=found, needed=needed, fix=fix)
+        raise InputError(where=where, found=problem, needed=needed, fix=fix)
     ranges: list[RangesOrProblem] = []
     for name, steps in zip(names, table.num_steps.tolist(), strict=True):
-        pairs = _pairs(ranges_by_identity.get(name, []), steps)
+        pairs = _parse_ranges(ranges_by_identity.get(name, []), steps)
         if pairs is None:
             needed = f"pairs [start, end) of steps from 0 to {steps}, the episode's length, that do not overlap"
             raise InputError(
@@ -103,7 +108,7 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     return StepSelection.from_ranges(ranges)
 
 
-def _pairs(ranges: object, steps: int) -> list[tuple[int, int]] | None:
+def _parse_ranges(ranges: object, steps: int) -> list[tuple[int, int]] | None:
     """Return the sorted ranges of one episode; None if they are not pairs of its steps or overlap."""
     try:
         pairs = sorted((start, end) for start, end in ranges)  # type: ignore[attr-defined] # see the except clause
@@ -114,7 +119,7 @@ def _pairs(ranges: object, steps: int) -> list[tuple[int, int]] | None:
     return pairs if are_steps and edges == sorted(edges) and all(start < end for start, end in pairs) else None
 
 
-def kept_ranges(episode: Episode, config: IdleConfig) -> list[tuple[int, int]]:
+def find_selected_ranges(episode: Episode, config: IdleConfig) -> list[tuple[int, int]]:
     """Return the ranges [start, end) of steps that an episode keeps under the rule `commands` or `motion`.
 
     Raises:

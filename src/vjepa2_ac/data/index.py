@@ -120,7 +120,7 @@ class Labels:
 class EpisodeTable(Sequence[EpisodeInfo]):
     """The usable episodes of a data set, in the source's order, as columns.
 
-    `locators` are columns by which the source finds an episode; `labels` are groups of episodes, such as the scene;
+    `locators` are columns with which the source finds an episode; `labels` are groups of episodes, such as the scene;
     `texts` are small values of the whole data set.
     """
 
@@ -289,12 +289,13 @@ T = TypeVar("T", EpisodeTable, StepSelection)
 
 
 def nul_error(identity: str, where: str) -> InputError:
-    """Return the error of an identity with a NUL character, which arrays of type S lose at the end of a text."""
-    text, fix = (
-        f"a NUL character in the identity {identity!r}",
-        "Remove the character from the identity in the data set",
+    """Return the error of an identity with a NUL character, which NumPy arrays of type S drop at the end of a text."""
+    return InputError(
+        where=where,
+        found=f"a NUL character in the identity {identity!r}",
+        needed="text without NUL characters",
+        fix="Remove the character from the identity in the data set",
     )
-    return InputError(where=where, found=text, needed="text without NUL characters", fix=fix)
 
 
 def hash_identity(identity: str) -> int:

@@ -2,7 +2,7 @@
 
 The batch at a position of the run is a pure function of the seed and the position. Workers affect only the speed; they
 send batches through shared memory. A run never waits forever for a worker: it ends if a worker dies, cannot send a
-batch, or does not deliver one shortly after a stop signal.
+batch, or does not deliver a batch within a few seconds of a stop signal.
 """
 
 from __future__ import annotations
@@ -59,18 +59,12 @@ class ProcessShare:
 
     rank: int = 0
     processes: int = 1
-    micro_batches_per_step: int | None = (
-        None  # micro-batches per optimizer step of all processes together; None: one per process
-    )
+    micro_batches_per_step: int | None = None  # of all processes together, per optimizer step; None: one per process
 
     @property
     def micro_batches(self) -> range:
         """The indices of the micro-batches of a step that this process computes: rank, rank + processes, ..."""
-        return range(
-            self.rank,
-            self.processes if self.micro_batches_per_step is None else self.micro_batches_per_step,
-            self.processes,
-        )
+        return range(self.rank, self.micro_batches_per_step or self.processes, self.processes)
 
 
 SINGLE_PROCESS = ProcessShare()
@@ -172,18 +166,18 @@ def read_batches(
     Raises:
         InputError: A clip cannot be read; or all clips were skipped and `allow_empty` is False.
     """
-    count, empty = len(windows), not allow_empty
+    count, is_empty = len(windows), True
     rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
     workers = dataset.config.workers if count >= MIN_CLIPS_FOR_WORKERS else 0
     clips = _MicroBatches(dataset, partial(_window_request, dataset, windows))
     for batch in Batches(map_in_workers(clips, iter(rows), workers), dataset.broken):
         if batch.starts:
-            empty = False
+            is_empty = False
             yield batch
-    if empty:
-        found = f"none of the clips can be read; broken episodes: {format_identities(tuple(dataset.broken.reasons))}"
+    if is_empty and not allow_empty:
+        problem = f"none of the clips can be read; broken episodes: {format_identities(tuple(dataset.broken.reasons))}"
         fix = "Repair or fetch these episodes again, or add them to data.exclude"
-        raise InputError(where=f"data.path: {dataset.config.path}", found=found, fix=fix)
+        raise InputError(where=f"data.path: {dataset.config.path}", found=problem, fix=fix)
 
 
 def _window_request(dataset: Dataset, windows: Sequence[tuple[int, int]], position: int) -> ClipRequest:
@@ -196,14 +190,14 @@ class _MicroBatches(TorchDataset[Batch]):
 
     dataset: Dataset
     request_at: Callable[[int], ClipRequest]  # a pure function of the position, the same in every worker
-    changes: ClipTransforms | None = None  # transforms of training clips; pure functions, too
+    transforms: ClipTransforms | None = None  # of training clips; also pure functions of the position
     replayed: _MicroBatches | None = None  # clips of the second data set
     share: Fraction = Fraction(0)  # share of clips from the second data set
 
     def __getitems__(self, positions: list[int]) -> Batch | UserError:
         """Return a micro-batch, or its error, because DataLoader would change the type of a raised error.
 
-        A worker moves the batch into shared memory here. PyTorch would do so in a thread, whose errors get lost.
+        A worker moves the batch into shared memory here. PyTorch would do so in a thread, whose errors are lost.
         """
         before = storage.bytes_fetched()
         try:
@@ -236,7 +230,7 @@ class _MicroBatches(TorchDataset[Batch]):
             if self.dataset.config.broken_episodes == "error":
                 raise self.dataset.broken.add_fix(error, [name]) from None
             return SkippedClip(name, str(error))
-        return clip if self.changes is None else self.changes.apply(clip, position)
+        return clip if self.transforms is None else self.transforms.apply(clip, position)
 
 
 class Batches(Iterator[Batch]):
@@ -302,7 +296,7 @@ def map_in_workers(
         items,
         batch_sampler=positions,
         collate_fn=_identity,
-        generator=torch.Generator(),  # the default generator is the one of dropout
+        generator=torch.Generator(),  # leaves the default generator, which dropout uses, unchanged
         num_workers=workers,
         multiprocessing_context=context,
         worker_init_fn=_prepare_worker if workers else None,
@@ -319,7 +313,7 @@ def map_in_workers(
         while (row := _next_row(rows, worker_processes)) is not None:
             yield row
     finally:
-        del rows  # asks the workers to end, and waits for a while
+        del rows  # PyTorch requests the workers to end, and waits for them for a limited time
         _end_workers(worker_processes)
         atexit.unregister(at_exit)
 
@@ -336,15 +330,19 @@ def _next_row(rows: Iterator[Any], workers: Iterable[BaseProcess]) -> Any:
             return next(rows, None)
         except RuntimeError as error:
             if dead := [worker for worker in workers if not worker.is_alive()]:
-                found = f"a loader worker has ended unexpectedly (exit code {dead[0].exitcode})"
+                problem = f"a loader worker has ended unexpectedly (exit code {dead[0].exitcode})"
                 fix = f"If memory is full, lower data.workers. With {_NO_WORKERS} the main process reads the clips"
-                raise UnreachableError(where="data.workers", found=found, fix=fix) from error
+                raise UnreachableError(where="data.workers", found=problem, fix=fix) from error
             if "timed out" not in str(error):
                 raise
         stop = stop_request()
         if min(stop.age_s, time.monotonic() - started) > _GRACE_S:
-            found, fix = f"no batch arrived after {stop.reason}", "The same command resumes from the newest checkpoint"
-            raise UnreachableError(where="data", found=found, needed=f"a batch within {_GRACE_S:.0f} s", fix=fix)
+            raise UnreachableError(
+                where="data",
+                found=f"no batch arrived after {stop.reason}",
+                needed=f"a batch within {_GRACE_S:.0f} s",
+                fix="Run the same command again to resume from the newest checkpoint",
+            )
 
 
 def _end_workers(workers: Iterable[BaseProcess]) -> None:
@@ -422,7 +420,7 @@ def require_shared_memory(data: DataConfig, batch_bytes: float, processes: int =
 
 
 def _in_shared_memory(batch: Batch) -> Batch:
-    """Move a batch into shared memory. PyTorch would do so in the thread that sends the batch, whose errors get lost.
+    """Move a batch into shared memory. PyTorch would do so in the thread that sends the batch, whose errors are lost.
 
     Raises:
         UnreachableError: There is too little shared memory.
@@ -430,8 +428,8 @@ def _in_shared_memory(batch: Batch) -> Batch:
     try:
         return batch.map_tensors(Tensor.share_memory_)
     except RuntimeError as error:
-        found = f"not enough space for a batch of {_megabytes(batch.nbytes)} from a loader worker ({error})"
-        raise UnreachableError(where=str(SHARED_MEMORY), found=found, fix=_MORE_SHARED_MEMORY) from None
+        problem = f"not enough space for a batch of {_megabytes(batch.nbytes)} from a loader worker ({error})"
+        raise UnreachableError(where=str(SHARED_MEMORY), found=problem, fix=_MORE_SHARED_MEMORY) from None
 
 
 def _megabytes(size: float) -> str:

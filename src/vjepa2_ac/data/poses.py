@@ -2,8 +2,8 @@
 
 The conventions of states are in `vjepa2_ac.episode`. A wrong format of three rotation numbers is detected at jumps: an
 Euler angle jumps by 2 pi where it passes pi, and a rotation vector changes its sign, although the hand turns smoothly.
-Read in the right format, the rotation at a jump of the numbers is as small as at other steps; read in another format,
-the hand turns abruptly. The mean speed does not show the format, because a wrong format may make the hand faster or
+In the right format, the rotation at a jump of the numbers is as small as at other steps; in another format the hand
+seems to turn abruptly. The mean speed does not show the format, because a wrong format may make the hand faster or
 slower.
 """
 
@@ -115,8 +115,8 @@ def require_selection(
     if fields.select is not None:
         where, count = f"{section_path}.select", len(fields.select)
         if beyond := [number for number in fields.select if number >= width]:
-            found = f"index {beyond[0]}, but {source} has {counted(width, 'number')}"
-            raise InputError(where=where, found=found, needed=f"indices from 0 to {width - 1}")
+            problem = f"index {beyond[0]}, but {source} has {counted(width, 'number')}"
+            raise InputError(where=where, found=problem, needed=f"indices from 0 to {width - 1}")
     rotation_width = num_rotation_numbers(fields.rotation)
     if is_pose and count != 4 + rotation_width:
         kind = "a quaternion's 4 numbers" if rotation_width == 4 else "3 numbers of the rotation"
@@ -132,8 +132,8 @@ def _require_unit_quaternions(quaternions: Float[np.ndarray, "steps 4"], where: 
     is_wrong = ~(abs(lengths - 1) <= _UNIT_TOLERANCE)  # NaN is wrong, too
     if is_wrong.any():
         step = int(is_wrong.argmax())
-        found = f"the quaternion {np.array2string(quaternions[step], precision=4)} of length {lengths[step]:.4g}"
-        raise InputError(where=f"{where}: step {step}", found=found, needed="a unit quaternion", fix=fix)
+        problem = f"the quaternion {np.array2string(quaternions[step], precision=4)} of length {lengths[step]:.4g}"
+        raise InputError(where=f"{where}: step {step}", found=problem, needed="a unit quaternion", fix=fix)
 
 
 # ---- formats of rotations ----

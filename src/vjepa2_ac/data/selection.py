@@ -49,9 +49,10 @@ def select_included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray,
     names = {index: name for index in candidates if (name := table.identity(index)) in excluded}
     unknown = excluded.difference(names.values(), (problem.name for problem in table.problems))
     if unknown:
-        found = f"unknown episodes: {format_identities(sorted(unknown))}"
         needed = "identities of episodes" + (f", such as {table.identity(0)}" if len(table) else "")
-        raise InputError(where="data.exclude", found=found, needed=needed)
+        raise InputError(
+            where="data.exclude", found=f"unknown episodes: {format_identities(sorted(unknown))}", needed=needed
+        )
     is_selected = np.ones(len(table), bool)
     is_selected[list(names)] = False
     return is_selected
@@ -66,13 +67,13 @@ def select_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, 
     if config.outcome == "all":
         return np.ones(len(table), bool)
     if len(table) and (table.success < 0).all():
-        found = f"no episode of {config.path} has a success label"
-        raise InputError(where=f"data.outcome: {config.outcome}", found=found, fix="Set data.outcome: all")
+        problem = f"no episode of {config.path} has a success label"
+        raise InputError(where=f"data.outcome: {config.outcome}", found=problem, fix="Set data.outcome: all")
     return np.asarray(table.success == (config.outcome == "success"))
 
 
 def require_distinct(table: EpisodeTable, is_selected: Bool[np.ndarray, " episodes"], config: DataConfig) -> None:
-    """Refuse two episodes with the same identity, because errors and `data.exclude` could not tell them apart.
+    """Refuse two episodes with the same identity, because errors and `data.exclude` could not distinguish them.
 
     Raises:
         InputError: Two used episodes have the same identity.
@@ -83,11 +84,8 @@ def require_distinct(table: EpisodeTable, is_selected: Bool[np.ndarray, " episod
     for index in members[np.isin(table.id_hash[members], hashes[counts > 1])].tolist():
         name = table.identity(index)
         if name in indices:
-            found, fix = (
-                f"episodes {indices[name]} and {index} have the same identity: {name}",
-                config.same_identity_fix,
-            )
-            error = InputError(where=f"data.path: {config.path}", found=found, fix=fix)
+            problem = f"episodes {indices[name]} and {index} have the same identity: {name}"
+            error = InputError(where=f"data.path: {config.path}", found=problem, fix=config.same_identity_fix)
             raise add_exclusion_fix(error, [name]) if hashes.size > 1 else error
         indices[name] = index
 
@@ -181,9 +179,9 @@ class BrokenEpisodes:
         if len(self) <= (allowed := max_broken(self._episodes)):
             return
         name, reason = next(iter(self.reasons.items()))
-        found = f"{len(self)} of {self._episodes} episodes are broken. The first, {name}: {reason.rstrip('.')}"
+        problem = f"{len(self)} of {self._episodes} episodes are broken. The first, {name}: {reason.rstrip('.')}"
         needed, fix = f"at most {allowed} with data.broken_episodes: skip", "Repair or fetch them again"
-        error = InputError(where=f"data.path: {self._config.path}", found=found, needed=needed, fix=fix)
+        error = InputError(where=f"data.path: {self._config.path}", found=problem, needed=needed, fix=fix)
         raise self.add_fix(error, tuple(self.reasons))
 
 
@@ -340,9 +338,11 @@ def hash_groups(
         from_source = split_by in table.labels
         reason = "the data set has no value for" if from_source else "the pattern does not match the identities of"
         alternative = "choose another field" if from_source else "choose a pattern that fits every identity"
-        found = f"{reason} {len(ungrouped)} of {counted(is_selected.sum(), 'episode')}: {format_identities(ungrouped)}"
+        problem = (
+            f"{reason} {len(ungrouped)} of {counted(is_selected.sum(), 'episode')}: {format_identities(ungrouped)}"
+        )
         fix = f"Exclude these with data.exclude, or {alternative}"
-        raise InputError(where=f"data.split_by: {split_by}", found=found, fix=fix)
+        raise InputError(where=f"data.split_by: {split_by}", found=problem, fix=fix)
     hashes = {group: hash_identity(group) for group in groups if group}
     any_hash = next(iter(hashes.values()), 0)
     return np.array([hashes[group] if group else any_hash for group in groups], np.uint64)
@@ -355,8 +355,8 @@ def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
     if split_by not in IDENTITY_PATTERNS and re.fullmatch(r"[A-Za-z_]+", split_by):
         fields = ", ".join(table.labels) or "no fields"
         example = f", such as {identities[0]}" if identities else ""
-        found = f"unknown field. This data set has {fields}; built-in patterns are {', '.join(IDENTITY_PATTERNS)}"
+        problem = f"unknown field. This data set has {fields}; built-in patterns are {', '.join(IDENTITY_PATTERNS)}"
         needed = f"a field, a built-in pattern, or a regular expression with one group for the identity{example}"
-        raise InputError(where=f"data.split_by: {split_by}", found=found, needed=needed)
+        raise InputError(where=f"data.split_by: {split_by}", found=problem, needed=needed)
     search = re.compile(IDENTITY_PATTERNS.get(split_by, split_by)).search
     return [match.group(1) if (match := search(identity)) else None for identity in identities]

@@ -63,7 +63,7 @@ def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
 
 def crop_frames(
     frames: UInt8[np.ndarray, "time height width 3"], kind: Crop = "released"
-) -> UInt8[np.ndarray, "time seen_height seen_width 3"]:
+) -> UInt8[np.ndarray, "time crop_height crop_width 3"]:
     """Return the part of the frames that the model receives, at the original resolution; see `DataConfig.crop`.
 
     The result shares memory with the frames, unless letterbox adds bars.
@@ -161,12 +161,10 @@ class ClipTransforms:
 
 def _require_same_shapes(result: object, before: Clip, name: str) -> None:
     """Refuse the result of a transform if shapes or types differ from its input; the size of frames may differ."""
-    found, needed = (
-        [_describe_array(clip, part) for part in ("frames", "states", "actions")] for clip in (result, before)
-    )
-    for described, required in zip(found, needed, strict=True):
-        if described != required:
-            raise InputError(where=f"data.transforms: {name}", found=described, needed=required)
+    for part in ("frames", "states", "actions"):
+        actual, needed = _describe_array(result, part), _describe_array(before, part)
+        if actual != needed:
+            raise InputError(where=f"data.transforms: {name}", found=actual, needed=needed)
 
 
 def _describe_array(clip: object, part: str) -> str:

@@ -24,7 +24,9 @@ from vjepa2_ac.errors import InputError, counted
 logger = logging.getLogger(__name__)
 
 _ROUNDS = 8  # rounds of the Feistel network
-_HALF_BITS = 3  # least width of its halves; smaller ones make some orders of few windows more likely
+_HALF_BITS = (
+    3  # smallest number of bits of a half; with fewer bits some orders of few windows are more likely than others
+)
 _MASK64 = (1 << 64) - 1
 
 
@@ -70,19 +72,18 @@ class Windows:
         return np.unique(self.episode)
 
 
-def find_clip_windows(table: EpisodeTable, kept_steps: StepSelection, config: DataConfig) -> Windows:
-    """Return the windows of all clips that fit into the kept ranges.
+def find_clip_windows(table: EpisodeTable, selected_steps: StepSelection, config: DataConfig) -> Windows:
+    """Return the windows of all clips that fit into the selected ranges of steps.
 
-    With `data.start_every` = n, clips start at every n-th step, counted from the first kept step of their episode.
+    With `data.start_every` = n, clips start at every n-th step, counted from the first selected step of their episode.
     """
-    span = kept_steps.end - kept_steps.start - (config.clip_steps - 1)
+    span = selected_steps.end - selected_steps.start - (config.clip_steps - 1)
     phase = np.zeros(len(table), np.int32)
-    phase[kept_steps.episode[::-1]] = kept_steps.start[
-        ::-1
-    ]  # reversed, so that the first range of an episode is written last
-    skipped = (phase[kept_steps.episode] - kept_steps.start) % config.start_every
+    # In reverse order, so that the first range of an episode is written last.
+    phase[selected_steps.episode[::-1]] = selected_steps.start[::-1]
+    skipped = (phase[selected_steps.episode] - selected_steps.start) % config.start_every
     count = -((skipped - span) // config.start_every)  # rounded up; 0 or less if no clip fits
-    runs = Windows(kept_steps.episode, kept_steps.start + skipped, count, config.start_every).select(count > 0)
+    runs = Windows(selected_steps.episode, selected_steps.start + skipped, count, config.start_every).select(count > 0)
     return runs.select(np.lexsort((runs.first, table.id_rank[runs.episode])))
 
 
@@ -108,22 +109,22 @@ def select_split_windows(
     names = tuple(table.identity(index) for index in short[: MAX_NAMED + 1].tolist())
     if len(short) == count:
         longest = int(short[np.argmax(table.num_steps[short])])
-        found = f"all {count} {split} episodes are shorter than a clip; the longest,"
-        found += f" {table.identity(longest)}, has {counted(table.num_steps[longest], 'step')}."
-        found += f" Too short: {format_identities(names, len(short))}"
-        raise InputError(where=where, found=found, needed=length, fix="Lower data.frames or data.stride")
+        problem = f"all {count} {split} episodes are shorter than a clip; the longest,"
+        problem += f" {table.identity(longest)}, has {counted(table.num_steps[longest], 'step')}."
+        problem += f" Too short: {format_identities(names, len(short))}"
+        raise InputError(where=where, found=problem, needed=length, fix="Lower data.frames or data.stride")
     if len(short):
         clip = f"a clip of {config.clip_steps} control steps and are skipped: {format_identities(names, len(short))}"
         _warn_once(f"{config.path}: {len(short)} of {count} {split} episodes are shorter than {clip}")
     windows = starts.select(members[starts.episode])
     if not len(windows):
-        found = f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})"
+        problem = f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})"
         fix = "Lower data.frames or data.stride, or set data.idle.rule: none"
-        raise InputError(where=where, found=found, needed=length, fix=fix)
+        raise InputError(where=where, found=problem, needed=length, fix=fix)
     return replace(windows, short=tuple(short.tolist()))
 
 
-@lru_cache(maxsize=64)  # each text is logged once, although every validation asks for the same windows
+@lru_cache(maxsize=64)  # each text is logged once, although every validation requests the same windows
 def _warn_once(text: str) -> None:
     logger.warning("%s", text)
 

@@ -112,8 +112,8 @@ class Decoder(nn.Module):
         """
         shape = self.shape
         if tuple(latents.shape[-2:]) != (shape.grid**2, shape.dim):
-            found = "x".join(map(str, latents.shape[-2:]))
-            raise ValueError(f"latents of shape {found}; this decoder expects {shape.grid**2}x{shape.dim}")
+            actual = "x".join(map(str, latents.shape[-2:]))
+            raise ValueError(f"latents of shape {actual}; this decoder expects {shape.grid**2}x{shape.dim}")
         frames = latents.reshape(-1, *latents.shape[-2:])
         numbers: Tensor = self.unfold(self.linear(frames))
         if self.further is not None:
@@ -270,10 +270,10 @@ class TrainedDecoder:
             for name, decoder_value, model_value in compared
             if decoder_value != model_value
         ]:
-            found = f"the decoder does not fit the encoder and crop of {subject} ({'; '.join(differing)})"
+            problem = f"the decoder does not fit the encoder and crop of {subject} ({'; '.join(differing)})"
             needed = "a decoder trained on latents of the same encoder and crop"
             fix = "Train a decoder with `vjepa2-ac decoder CONFIG` and the config of this model"
-            raise InputError(where=f"{self.where} {self.name}", found=found, needed=needed, fix=fix)
+            raise InputError(where=f"{self.where} {self.name}", found=problem, needed=needed, fix=fix)
         decoder_data = SIMULATED if self.name.startswith(BUILTIN) else card.data
         model_data = NO_DATA if data.is_cache else data.path
         if model_data == NO_DATA or _is_same_data(decoder_data, model_data):
@@ -297,9 +297,9 @@ def save_decoder(folder: Path, card: DecoderCard, weights: Mapping[str, Tensor])
     Raises:
         InputError: The folder cannot be written.
     """
-    with folder_writer(folder, CARD) as fresh:
-        save_tensors(weights, fresh / WEIGHTS)
-        (fresh / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n", encoding="utf-8")
+    with folder_writer(folder, CARD) as temporary:
+        save_tensors(weights, temporary / WEIGHTS)
+        (temporary / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n", encoding="utf-8")
 
 
 def load_decoder(name: str | Path, *, where: str = "--decoder") -> TrainedDecoder:
@@ -331,6 +331,5 @@ def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
         values = read_json_object(path, needed=_NEEDED, fix=_FIX)
     except MissingFileError:
         fix = "Train a decoder with `vjepa2-ac decoder CONFIG`; the same command resumes an unfinished training"
-        found = f"no {CARD}"
-        raise InputError(where=f"{where} {folder}", found=found, needed=_NEEDED, fix=fix) from None
+        raise InputError(where=f"{where} {folder}", found=f"no {CARD}", needed=_NEEDED, fix=fix) from None
     return parse_record(DecoderCard, values, where=str(path), needed=_NEEDED, fix=_FIX)

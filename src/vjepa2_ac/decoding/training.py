@@ -76,9 +76,7 @@ _SCALES = 3
 _WARMUP, _WARMUP_SHARE = 500, 15  # the warm-up has at most 500 steps, and at most 1/15 of all steps
 _WEIGHT_DECAY, _BETAS, _MAX_GRAD_NORM = 0.05, (0.9, 0.95), 1.0
 _AVERAGE, _AVERAGED_SHARE = 0.999, 4.5  # largest decay of the average; a short training averages over its last 22 %
-_AVERAGE_DELAY = (
-    9.0  # in early steps the decay is at most step / (step + 9), so that the initial weights are soon forgotten
-)
+_AVERAGE_DELAY = 9.0  # early decays are at most step / (step + 9), so that the initial weights lose weight quickly
 
 
 def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bool = False) -> Path:
@@ -110,7 +108,7 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
             lock.take()
             with translate_write_errors(folder):
                 write_atomically(folder / KEY, json.dumps({"key": dict(setup.key.parts)}, indent=1) + "\n")
-            _try_one_step(setup)
+            _run_trial_step(setup)
             _encode_and_train(setup, reporter)
             reporter.note(f"Saved the decoder to {folder} (PSNR and SSIM: {folder / CARD})")
         shutil.rmtree(setup.files.folder, ignore_errors=True)  # also if an earlier start was killed before this line
@@ -187,9 +185,9 @@ def _prepare(config: Config, reporter: Reporter) -> Setup:
         "test": select_frames(dataset, "test", frames=_HELD_OUT_FRAMES),  # may be none
     }
     if not frames["train"]:
-        found, needed = "no training frames", "at least one training episode that is as long as a clip"
+        problem, needed = "no training frames", "at least one training episode that is as long as a clip"
         fix = "Lower data.validation_share or data.test_share"
-        raise InputError(where=f"data.path: {config.data.path}", found=found, needed=needed, fix=fix)
+        raise InputError(where=f"data.path: {config.data.path}", found=problem, needed=needed, fix=fix)
     reporter.task(LOADING)
     model = load_base(config.model, seed=config.seed)
     encoding, size, patch = get_encoding(model, config), model.image_size, model.sizes.patch_size
@@ -221,7 +219,7 @@ def _require_disk_space(setup: Setup, reporter: Reporter) -> None:
     reporter.note(f"{count_frames(all_frames):,} frames; the training needs {size} of disk for frames and latents")
 
 
-def _try_one_step(setup: Setup) -> None:
+def _run_trial_step(setup: Setup) -> None:
     """Run one step on zeros as a memory check, before the frames are encoded."""
     if setup.encoder.device.type == "cuda":
         shape, count = setup.shape, setup.config.decoder.batch_size
@@ -366,9 +364,9 @@ class DecoderSteps:
         read = torch.stack([value.detach().float() for value in values.values()]).tolist()  # waits for the device once
         metrics = dict(zip(values, read, strict=True))
         if not math.isfinite(metrics["gradient_norm"]):
-            found = f"{self._config.decoder.learning_rate:g}; loss or gradients of step {step} are not finite"
+            problem = f"{self._config.decoder.learning_rate:g}; loss or gradients of step {step} are not finite"
             fix = f"Lower it and start again; delete {STATE} if it was saved after the loss had diverged"
-            raise InputError(where="decoder.learning_rate", found=found, fix=fix)
+            raise InputError(where="decoder.learning_rate", found=problem, fix=fix)
         self.optimizer.step()
         decay = min(_AVERAGE, 1 - _AVERAGED_SHARE / self._config.decoder.steps, step / (step + _AVERAGE_DELAY))
         for name, tensor in self.decoder.state_dict().items():  # detached tensors

@@ -81,17 +81,17 @@ def encode_frames(
         InputError: The width of the frames is not a multiple of the number of views.
     """
 
-    def encoded(part: UInt8[np.ndarray, "frames height all 3"]) -> Tensor:
+    def encode_part(part: UInt8[np.ndarray, "frames height all 3"]) -> Tensor:
         cropped = crop_frames(split_views(part, views), crop)
         pixels = torch.from_numpy(np.ascontiguousarray(cropped)).to(world_model.device)[None]
         latents = world_model.encode(pixels_to_input(pixels, world_model.image_size), chunk=chunk)[0]
         return latents.reshape(len(part), -1, latents.shape[-1])
 
-    return torch.cat([encoded(frames[first : first + chunk]) for first in range(0, len(frames), chunk)])
+    return torch.cat([encode_part(frames[first : first + chunk]) for first in range(0, len(frames), chunk)])
 
 
 def get_encoding(world_model: WorldModel, config: Config) -> Encoding:
-    """Return the settings that determine a model's latents: part of the key by which a cache is found or refused.
+    """Return the settings that determine a model's latents: they are part of the key of a latent cache.
 
     This function hashes the encoder's weights, which takes time.
     """
@@ -131,10 +131,10 @@ def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> No
         InputError: The widths differ.
     """
     if find_heads_to_replace(world_model.sizes, widths):
-        found = f"data with states of {widths.state} and actions of {widths.action} numbers"
+        problem = f"data with states of {widths.state} and actions of {widths.action} numbers"
         needed = f"{describe_model_widths(world_model.sizes)}, as this model requires"
         fix = "Choose other data, or train on this data: `train` replaces the model's input heads"
-        raise InputError(where=where, found=found, needed=needed, fix=fix)
+        raise InputError(where=where, found=problem, needed=needed, fix=fix)
 
 
 def get_extrinsics(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "batch time 6"] | None:
@@ -146,7 +146,7 @@ def get_extrinsics(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "ba
     if not world_model.sizes.predictor.use_extrinsics:
         return None
     if batch.extrinsics is None:
-        found = f"no camera pose in some of these episodes: {', '.join(dict.fromkeys(batch.episode_ids))}"
+        problem = f"no camera pose in some of these episodes: {', '.join(dict.fromkeys(batch.episode_ids))}"
         fix = "Choose a data.source and data.camera with camera poses, or a model without use_extrinsics"
-        raise InputError(where="model: predictor.use_extrinsics", found=found, fix=fix)
+        raise InputError(where="model: predictor.use_extrinsics", found=problem, fix=fix)
     return batch.extrinsics

@@ -121,9 +121,9 @@ def require_encodable(config: Config) -> None:
     fix = "Run `vjepa2-ac data calibrate CONFIG`, or set data.cache: auto to encode at the start of the training run"
     require_stride(data, to="know which frames are needed", fix=fix)
     if data.transforms:
-        found = "transforms that differ between clips, but a latent cache stores each frame once"
+        problem = "transforms that differ between clips, but a latent cache stores each frame once"
         raise InputError(
-            where="data.transforms", found=found, fix="Remove data.transforms, or train with data.cache: off"
+            where="data.transforms", found=problem, fix="Remove data.transforms, or train with data.cache: off"
         )
 
 
@@ -190,7 +190,7 @@ def use_latent_cache(
     Raises:
         InputError: The cache is from another encoder, is required and missing, or cannot be written.
     """
-    if (cache := _cache_of(config, dataset, model)) is None:
+    if (cache := _find_cache(config, dataset, model)) is None:
         return dataset
     if config.data.cache == "auto":
         if not check_only:
@@ -216,11 +216,11 @@ def use_finished_cache(config: Config, dataset: Dataset, model: WorldModel) -> D
     Raises:
         InputError: The data set is itself a latent cache, from another encoder.
     """
-    cache = _cache_of(config, dataset, model)
+    cache = _find_cache(config, dataset, model)
     return dataset if cache is None or cache.missing() else cache.open_dataset()
 
 
-def _cache_of(config: Config, dataset: Dataset, model: WorldModel) -> LatentCache | None:
+def _find_cache(config: Config, dataset: Dataset, model: WorldModel) -> LatentCache | None:
     """Return the latent cache of a config's data; None if caching is off or the data are a cache themselves."""
     if config.data.is_cache or config.data.cache == "off":
         require_same_encoder(model, dataset, config)
@@ -259,7 +259,7 @@ def require_shared(cache: LatentCache, is_visible: Callable[[], bool]) -> None:
     end = time.monotonic() + _VISIBILITY_TIMEOUT_S
     while not is_visible():
         if time.monotonic() > end:
-            found = "files of one process of the run are not visible to another process"
+            problem = "files of one process of the run are not visible to another process"
             fix = "Choose a folder that all machines of the run share, or run `vjepa2-ac encode` once on every machine"
-            raise InputError(where=f"data.cache_dir: {cache.folder}", found=found, fix=fix)
+            raise InputError(where=f"data.cache_dir: {cache.folder}", found=problem, fix=fix)
         time.sleep(_POLL_S)

@@ -218,9 +218,8 @@ class LatentCache:
             else ""
         )
         where = f"data.cache: {self.dataset.config.cache}: {self.folder}"
-        found = f"no latent cache for this model and these settings{nearest}"
         fix = "Run `vjepa2-ac encode` with this config, or set data.cache: auto"
-        raise InputError(where=where, found=found, fix=fix)
+        raise InputError(where=where, found=f"no latent cache for this model and these settings{nearest}", fix=fix)
 
 
 def count_frames(requests: Sequence[FramesToEncode]) -> int:
@@ -248,8 +247,7 @@ def require_space(folder: Path, frames: int, per_frame: int, *, fix: str) -> Non
     needed, free = frames * per_frame, free_bytes(folder)
     if needed > free:
         size = f"{needed / _GIGABYTE:.4g} GB for the latents of {frames:,} frames ({per_frame / 1e6:.3g} MB each)"
-        found = f"{free / _GIGABYTE:.4g} GB free on the disk"
-        raise InputError(where=str(folder), found=found, needed=size, fix=fix)
+        raise InputError(where=str(folder), found=f"{free / _GIGABYTE:.4g} GB free on the disk", needed=size, fix=fix)
 
 
 # ---- encoding ----
@@ -313,11 +311,11 @@ def encode_files(
     progress(done, total)
     writers = _MAX_PENDING_WRITES if storage.is_url(files.folder) else 1
     with ThreadPoolExecutor(threads, "decode") as decoders, ThreadPoolExecutor(writers, "write") as writer:
-        parts_ahead = _parts(decoders, dataset, requests, encoder, threads * _PREFETCHED_PARTS)
+        parts_ahead = _read_ahead(decoders, dataset, requests, encoder, threads * _PREFETCHED_PARTS)
         try:
             for request, parts in groupby(parts_ahead, itemgetter(0)):
                 try:
-                    encoded = _encode(encoder, request, parts, dataset.config.cache_dtype)
+                    encoded = _start_encoding(encoder, request, parts, dataset.config.cache_dtype)
                 except InputError as error:
                     dataset.skip_episode(request.episode, error)
                     files.record_broken(request.episode, request.camera, str(error))
@@ -335,7 +333,7 @@ def encode_files(
             decoders.shutdown(cancel_futures=True)
 
 
-def _parts(
+def _read_ahead(
     pool: ThreadPoolExecutor,
     dataset: Dataset,
     requests: Sequence[FramesToEncode],
@@ -350,14 +348,14 @@ def _parts(
         for first in range(0, len(request.steps), frames):
             steps = request.steps[first : first + frames].tolist()
             pinned = encoder.device.type == "cuda"
-            queue.append((request, pool.submit(_read, dataset, recording, steps, pinned=pinned)))
+            queue.append((request, pool.submit(_read_frames, dataset, recording, steps, pinned=pinned)))
             if len(queue) > ahead:
                 yield queue.popleft()
     while queue:
         yield queue.popleft()
 
 
-def _read(
+def _read_frames(
     dataset: Dataset, episode_future: Future[Episode], steps: Sequence[int], *, pinned: bool
 ) -> tuple[Episode, _Frames]:
     recording = episode_future.result()
@@ -365,22 +363,22 @@ def _read(
     return recording, frames.pin_memory() if pinned else frames
 
 
-def _encode(
+def _start_encoding(
     encoder: EncoderOnDevice, request: FramesToEncode, parts: _Parts, kind: CacheType
 ) -> Callable[[], EncodedEpisode]:
     """Start to encode an episode, and return a function that waits for the result."""
-    latents, pictures = list[StoredLatents](), list[Tensor]()
+    latents, inputs_as_pixels = list[StoredLatents](), list[Tensor]()
     for _, part in parts:
         recording, frames = part.result()
         pixels = frames.to(encoder.device, non_blocking=True)
         inputs = pixels_to_input(pixels[None], encoder.world_model.image_size)[0]
         latents.append(pack_latents(encoder.latents(inputs), kind).map_tensors(_to_host))
-        pictures.append(_to_host(input_to_pixels(inputs)))
+        inputs_as_pixels.append(_to_host(input_to_pixels(inputs)))
 
     def finish() -> EncodedEpisode:
         if encoder.device.type == "cuda":
             torch.cuda.synchronize(encoder.device)
-        images = np.ascontiguousarray(rearrange(torch.cat(pictures), "n c h w -> n h w c").numpy())
+        images = np.ascontiguousarray(rearrange(torch.cat(inputs_as_pixels), "n c h w -> n h w c").numpy())
         return EncodedEpisode(
             recording, request.camera, request.steps.tolist(), join_latents(latents, torch.cat), images
         )

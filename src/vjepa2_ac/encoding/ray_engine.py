@@ -48,9 +48,9 @@ def ray_engine(address: str) -> Iterator[Engine]:
     try:
         ray.init(**options, logging_level=logging.ERROR, log_to_driver=False)
     except (OSError, RuntimeError, ValueError) as error:
-        found = f"cannot connect to a Ray cluster ({error})"
+        problem = f"cannot connect to a Ray cluster ({error})"
         raise UnreachableError(
-            where=where, found=found, fix="Run `ray status` on the head node to check the address"
+            where=where, found=problem, fix="Run `ray status` on the head node to check the address"
         ) from None
     try:
         yield partial(_encode, where)

@@ -108,9 +108,9 @@ class Explorer:
         self.decoder, self.dataset, self.episodes, self.autocast = decoder, dataset, episodes, autocast
         self.simulate = simulate
         if self.spaces.action.follows == "unknown":
-            found = "the effect of the recorded commands on the state is not known"
+            problem = "the effect of the recorded commands on the state is not known"
             needed = "data.actions: difference, or data.join_actions: sum or last"
-            raise InputError(where="data.actions: recorded", found=found, needed=needed)
+            raise InputError(where="data.actions: recorded", found=problem, needed=needed)
         self._cached_pair = lru_cache(maxsize=256)(self._read_pair)
         self._cached_prediction = lru_cache(maxsize=_MAX_CACHED_STEPS * len(self.evaluated_models))(self._predict_step)
 

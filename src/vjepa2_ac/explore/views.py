@@ -42,12 +42,8 @@ _MAX_EPISODES = 500  # episodes in the list of the page
 _MAX_SAMPLED_EPISODES = 32  # episodes that are read to find the one with the most motion, and typical step sizes
 _STEP_PERCENTILE = 90.0  # percentile of the recorded changes that is proposed as step size
 _REST_SHARE = 0.1  # changes below this share of the largest change count as rest
-_DEFAULT_STEPS = (
-    0.05,
-    0.1,
-    0.5,
-    0.05,
-)  # step of positions, rotations, grippers, other numbers that never change in the data
+# Step sizes of numbers that never change in the data: positions (m), rotations (rad), grippers, other numbers.
+_DEFAULT_STEPS = (0.05, 0.1, 0.5, 0.05)
 _MOVES: tuple[tuple[str, int | None, int], ...] = (
     ("forward", 0, 1), ("back", 0, -1), ("left", 1, 1), ("right", 1, -1), ("up", 2, 1), ("down", 2, -1),
     ("turn left", 5, 1), ("turn right", 5, -1), ("open", 6, -1), ("close", 6, 1), ("zero action", None, 0),
@@ -253,8 +249,8 @@ class Views:
         if goal is None:
             return None
         if goal.episode >= len(explorer.episodes) or goal.step >= explorer.get_num_steps(goal.episode):
-            found = f"step {goal.step} of episode {goal.episode}"
-            raise InputError(where="goal", found=found, needed="a frame of one of the listed episodes")
+            problem = f"step {goal.step} of episode {goal.episode}"
+            raise InputError(where="goal", found=problem, needed="a frame of one of the listed episodes")
         return explorer.get_observation(goal.episode, goal.step)
 
     def _draw_error_map(self, errors: Float[Tensor, " tokens"]) -> Pixels:

@@ -94,8 +94,8 @@ def make_goals(
     if options.every is not None:
         keys = select_every_nth_frame(len(states), options.every)
     elif poses is None:
-        found, needed = "no measured poses", "an episode with poses and gripper"
-        raise InputError(where=name, found=found, needed=needed, fix="Use --every N to take every n-th frame")
+        problem, needed = "no measured poses", "an episode with poses and gripper"
+        raise InputError(where=name, found=problem, needed=needed, fix="Use --every N to take every n-th frame")
     else:
         keys = find_gripper_key_frames(poses, StillRule(min_distance=options.apart))
     first, *images = read_views(dataset, index, options.views, [0, *(key.frame for key in keys)])
@@ -115,6 +115,6 @@ def read_episode_frame(config: DataConfig, text: str) -> UInt8[np.ndarray, "heig
     episode = dataset.source.read(find_episode(dataset, name))
     count = len(episode.states)
     if step and int(step) >= count:
-        found = f"the episode has {counted(count, 'step')}"
-        raise InputError(where=f"--goal-from {text}", found=found, needed=f"a step from 0 to {count - 1}")
+        problem = f"the episode has {counted(count, 'step')}"
+        raise InputError(where=f"--goal-from {text}", found=problem, needed=f"a step from 0 to {count - 1}")
     return np.asarray(episode.read_frames([int(step) if step else count - 1])[0])

@@ -66,8 +66,8 @@ def make_camera_values(
         InputError: There is no feature with images of a camera.
     """
     if not features:
-        found = f"no camera, only depth maps ({', '.join(non_cameras)})" if non_cameras else "no camera"
-        raise InputError(where=where, found=found, needed="videos, or one image of the robot per step")
+        problem = f"no camera, only depth maps ({', '.join(non_cameras)})" if non_cameras else "no camera"
+        raise InputError(where=where, found=problem, needed="videos, or one image of the robot per step")
     names = make_camera_names(features)
     reason = f"cameras: {', '.join(names.values())}; the released model was trained on DROID's camera exterior_1_left"
     is_guess = len(names) > 1

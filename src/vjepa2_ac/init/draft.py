@@ -343,7 +343,8 @@ def _choose_shares(data: DatasetProperties) -> dict[Split, DraftValue]:
         count = max(1, round(share * data.episodes))
         required = min(_MAX_TEST_SHARE, math.ceil(100 * (MIN_EPISODES + 1) / data.episodes) / 100)
         test_share = max(share, required)
-        reason = f"about {count:,} of {counted(data.episodes, 'episode')}, selected by a hash"
+        about = "about " if data.episodes > 1 else ""
+        reason = f"{about}{count:,} of {counted(data.episodes, 'episode')}, selected by a hash"
     return {
         "validation": DraftValue(share, reason),
         "test": DraftValue(test_share, "episodes for `evaluate`; not used in training or validation"),
@@ -353,9 +354,8 @@ def _choose_shares(data: DatasetProperties) -> dict[Split, DraftValue]:
 def _choose_num_steps(data: DatasetProperties, clips_per_step: int) -> DraftValue:
     if data.steps is None:
         return DraftValue(_MIN_STEPS, "for a first run; docs/training.md explains how to choose the number")
-    steps_for_passes = (
-        math.ceil(_CLIPS_PER_CONTROL_STEP * data.steps / _CLIPS_PER_STEP / 100) * 100
-    )  # each control step starts a clip
+    # Each control step starts a clip.
+    steps_for_passes = math.ceil(_CLIPS_PER_CONTROL_STEP * data.steps / _CLIPS_PER_STEP / 100) * 100
     steps = max(_MIN_STEPS, min(_MAX_STEPS, steps_for_passes))
     clips = steps * clips_per_step / data.steps
     return DraftValue(steps, f"{clips:.2g} clips per control step of the data; more steps may make planning worse")

@@ -113,10 +113,9 @@ def select_vector_state(columns: Mapping[str, Column], where: str) -> dict[str, 
     """
     measured = [name for name in columns if re.search(r"observation|\bstate", name)]
     if not measured:
-        found = f"no column with measured numbers ({', '.join(columns) or 'no columns'})"
         raise InputError(
             where=where,
-            found=found,
+            found=f"no column with measured numbers ({', '.join(columns) or 'no columns'})",
             needed="columns of the robot's state, named observation… or state, of type float, int or bool",
         )
     chosen = max(measured, key=lambda name: (_last_part(name) == "state", columns[name].width))

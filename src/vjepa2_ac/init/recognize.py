@@ -159,10 +159,10 @@ def read_properties(path: str) -> DatasetProperties:
         return make_published_droid_properties()
     if not storage.is_url(path) and not Path(path).is_dir():
         fix = f"For a data set on the Hugging Face Hub write hf://datasets/{path}" if _HUB_NAME.fullmatch(path) else ""
-        found = "no such folder"
+        problem = "no such folder"
         if Path(path).is_file():
-            found, fix = "a file", f"Pass the folder that contains it: `{shell_command('init', Path(path).parent)}`"
-        raise InputError(where=path, found=found, needed="a folder or a URL", fix=fix)
+            problem, fix = "a file", f"Pass the folder that contains it: `{shell_command('init', Path(path).parent)}`"
+        raise InputError(where=path, found=problem, needed="a folder or a URL", fix=fix)
     with storage.translate_read_errors(path):
         if data := _read_with_plugins(path):
             return data
@@ -237,9 +237,9 @@ def _require_only_set(described: Sequence[tuple[str, str]], path: str) -> tuple[
         is_version = folder != path and _VERSION.fullmatch(_last_name(folder))
         sets.setdefault(folder.rpartition("/")[0] if is_version else folder, []).append((form, folder))
     if len(sets) > 1:
-        found = f"{len(sets)} data sets: {', '.join(sorted(sets))}"
+        problem = f"{len(sets)} data sets: {', '.join(sorted(sets))}"
         fix = f"Pass the path of one of them, for example `{shell_command('init', min(sets))}`"
-        raise InputError(where=path, found=found, needed="exactly one data set", fix=fix)
+        raise InputError(where=path, found=problem, needed="exactly one data set", fix=fix)
     versions = sorted(*sets.values(), key=lambda version: _as_version(_last_name(version[1])))
     return *versions[-1], [_last_name(folder) for _, folder in versions]
 

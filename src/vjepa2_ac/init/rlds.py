@@ -172,8 +172,8 @@ def _read_features(path: str) -> Iterator[tuple[str, _Feature]]:
     try:
         yield from _nested_features(content, "")
     except (AttributeError, TypeError, ValueError) as error:
-        found = f"an invalid feature description ({error})"
-        raise InputError(where=where, found=found, needed="a feature description written by TFDS") from None
+        problem = f"an invalid feature description ({error})"
+        raise InputError(where=where, found=problem, needed="a feature description written by TFDS") from None
 
 
 def _nested_features(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:

@@ -112,7 +112,7 @@ def read_sample(
     for index, episode in read_each(dataset, chosen, dataset.source.read, progress):
         camera = episode.extrinsics if dataset.config.pose_frame == "camera" else None
         yield ReadEpisode(
-            index, np.asarray(episode.states, np.float64), tuple(dataset.kept_steps.ranges_of(index)), camera
+            index, np.asarray(episode.states, np.float64), tuple(dataset.selected_steps.ranges_of(index)), camera
         )
 
 

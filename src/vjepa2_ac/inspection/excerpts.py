@@ -74,7 +74,7 @@ def excerpts_of(dataset: Dataset, *, episodes: int = EPISODES, steps: int = STEP
     """
 
     def read(index: int) -> Excerpt:
-        start, end = max(dataset.kept_steps.ranges_of(index), key=lambda one: one[1] - one[0])
+        start, end = max(dataset.selected_steps.ranges_of(index), key=lambda one: one[1] - one[0])
         first = start + max(0, end - start - steps) // 2
         chosen = range(first, min(end, first + steps))
         episode = dataset.read(index)

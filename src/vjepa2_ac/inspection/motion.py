@@ -191,7 +191,7 @@ def _check_rotation_format(dataset: Dataset, sample: Sequence[ReadEpisode]) -> I
     numbers = [
         one[start:end, POSE.rotation]
         for index, one in states.items()
-        for start, end in dataset.kept_steps.ranges_of(index)
+        for start, end in dataset.selected_steps.ranges_of(index)
     ]
     speeds = measure_rotation_speeds(numbers, dataset.control_rate_hz)
     if smoother := find_smoother_format(speeds, configured, FASTEST_RAD_S):
@@ -220,7 +220,7 @@ def _check_ends(dataset: Dataset) -> Finding:
     is_pose = dataset.spaces.state.position is not None
 
     def read(index: int) -> list[tuple[int, int, str]]:
-        ranges = dataset.kept_steps.ranges_of(index)
+        ranges = dataset.selected_steps.ranges_of(index)
         start, end = ranges[0][0], ranges[-1][1]
         count = min(_END_STEPS, (end - start + 1) // 2)
         episode = dataset.read(index)
@@ -237,7 +237,8 @@ def _check_ends(dataset: Dataset) -> Finding:
     black, frozen, example = max(ends, key=lambda end: max(end[:2]))
     if not black + frozen:
         return Finding("ok", "episode ends", f"no black or frozen frames ({checked})")
-    kind = f"{black} frames are black" if black > frozen else f"{frozen} frames are one image while the robot moves"
+    black_frames = "frame is black" if black == 1 else f"{black} frames are black"
+    kind = black_frames if black > frozen else f"{frozen} frames are one image while the robot moves"
     text = f"{sum(end[0] for end in ends):,} black and {sum(end[1] for end in ends):,} frozen frames ({checked})"
     return Finding("warning", "episode ends", f"{text}. Example: {example} {kind}. {_EXCLUDE}")
 
@@ -246,7 +247,7 @@ def _check_middles(dataset: Dataset) -> Finding:
     """Return the finding about episodes whose middle frame is blank, because a camera failed or images were lost."""
 
     def is_blank(index: int) -> bool:
-        start, end = max(dataset.kept_steps.ranges_of(index), key=lambda one: one[1] - one[0])
+        start, end = max(dataset.selected_steps.ranges_of(index), key=lambda one: one[1] - one[0])
         return bool(np.ptp(small_grey(dataset.read(index).read_frames([(start + end) // 2]))) < BLANK)
 
     seen = dict(read_each(dataset, sample_of(dataset, affordable(dataset, _MIDDLES)), is_blank))

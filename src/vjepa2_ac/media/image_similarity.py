@@ -59,7 +59,7 @@ def ssim_map(predicted: Images, true: Images) -> Pixels:
     Source: Wang, Bovik, Sheikh, Simoncelli (2004), Image Quality Assessment, equation 13; borders are reflected as in
     torchmetrics 1.9.0, whose values agree to 1e-5.
     """
-    return _terms(predicted, true)[0].mean(dim=-3)
+    return _compute_terms(predicted, true)[0].mean(dim=-3)
 
 
 def ms_ssim(predicted: Images, true: Images, scales: int) -> PerImage:
@@ -79,8 +79,8 @@ def ms_ssim(predicted: Images, true: Images, scales: int) -> PerImage:
     product: Tensor | float = 1.0
     for scale, weight in enumerate(_SCALE_WEIGHTS[:scales]):
         if scale:
-            predicted, true = _halved(predicted), _halved(true)
-        similarity, contrast = _terms(predicted, true)
+            predicted, true = _halve(predicted), _halve(true)
+        similarity, contrast = _compute_terms(predicted, true)
         inside = contrast[..., _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]  # pixels whose window has no reflected pixels
         factor = (similarity if scale == scales - 1 else inside).mean(dim=-3).mean(dim=(-2, -1))
         product = product * _power(factor, weight / sum(_SCALE_WEIGHTS[:scales]))
@@ -106,12 +106,12 @@ def masked_mean(values: Pixels, mask: Mask | None) -> PerImage:
     return torch.where(mask, values, 0).sum(dim=(-2, -1)) / mask.sum(dim=(-2, -1))
 
 
-def _terms(predicted: Channels, true: Channels) -> tuple[Channels, Channels]:
+def _compute_terms(predicted: Channels, true: Channels) -> tuple[Channels, Channels]:
     """Return (similarity, contrast) at each pixel of each channel."""
     height, width = predicted.shape[-2:]
     with torch.autocast(predicted.device.type, enabled=False):
         x, y = predicted.float(), true.float()
-        rows, columns = (_window(side, predicted.device) for side in (height, width))
+        rows, columns = (_make_window_matrix(side, predicted.device) for side in (height, width))
         moments = torch.stack([x, y, x * x, y * y, x * y])
         mean_x, mean_y, square_x, square_y, product = rows @ moments @ columns.T
         variances = (square_x - mean_x**2).clamp(min=0) + (square_y - mean_y**2).clamp(min=0)
@@ -122,7 +122,7 @@ def _terms(predicted: Channels, true: Channels) -> tuple[Channels, Channels]:
 
 
 @lru_cache(maxsize=16)
-def _window(side: int, device: torch.device) -> Float[Tensor, "side side"]:
+def _make_window_matrix(side: int, device: torch.device) -> Float[Tensor, "side side"]:
     """Return the matrix that smooths a line of pixels with the Gaussian window, reflected at both ends.
 
     A matrix product is computed in full float32, whereas a convolution may use TF32, which is too coarse for the
@@ -140,7 +140,7 @@ def _window(side: int, device: torch.device) -> Float[Tensor, "side side"]:
         return matrix.to(device, torch.float32)
 
 
-def _halved(images: Channels) -> Float[Tensor, "*batch channel rows columns"]:
+def _halve(images: Channels) -> Float[Tensor, "*batch channel rows columns"]:
     flat = images.float().reshape(-1, *images.shape[-3:])
     halved = torch.nn.functional.avg_pool2d(flat, 2)
     return halved.reshape(*images.shape[:-2], *halved.shape[-2:])

@@ -18,7 +18,7 @@ from PIL import ExifTags, Image, ImageOps
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import StateSpace, rotation_angles
 from vjepa2_ac.storage import read_small_file, translate_read_errors
 
@@ -41,10 +41,10 @@ def require_decodable_size(height: int, width: int, where: str, *, count: int = 
         InputError: The images are too large.
     """
     if not 0 < height * width <= MAX_PIXELS or count * height * width * 3 > _MAX_BYTES:
-        found = f"{count} images of {height} x {width} pixels, decoded together"
+        problem = f"{counted(count, 'image')} of {height} x {width} pixels, decoded together"
         needed = f"at most {MAX_PIXELS // 10**6} megapixels each, and {_MAX_BYTES // 10**9} GB together"
         fix = "Reduce the size of the images, exclude the episode, or lower data.frames"
-        raise InputError(where=where, found=found, needed=needed, fix=fix)
+        raise InputError(where=where, found=problem, needed=needed, fix=fix)
 
 
 def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = None) -> None:
@@ -58,14 +58,14 @@ def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = No
     Raises:
         InputError: The array has another shape or type.
     """
-    found = f"an array of shape {image.shape} and type {image.dtype}"
+    problem = f"an array of shape {image.shape} and type {image.dtype}"
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape[:2]) < _MIN_SIDE:
         needed = f"an RGB image: height x width x 3, uint8, {_MIN_SIDE} pixels or more"
-        raise InputError(where=where, found=found, needed=needed)
+        raise InputError(where=where, found=problem, needed=needed)
     if like is not None and image.shape != like.shape:
-        found = f"{image.shape[1]} x {image.shape[0]} pixels (width x height)"
+        problem = f"{image.shape[1]} x {image.shape[0]} pixels (width x height)"
         needed = f"{like.shape[1]} x {like.shape[0]}, like the goal image: same camera, viewpoint and resolution"
-        raise InputError(where=where, found=found, needed=needed)
+        raise InputError(where=where, found=problem, needed=needed)
 
 
 def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
@@ -75,8 +75,8 @@ def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
         InputError: The sizes differ.
     """
     if mask.shape != like.shape[:2]:
-        found, needed = f"shape {mask.shape} (height, width)", f"{like.shape[:2]}, like the goal image"
-        raise InputError(where=where, found=found, needed=needed)
+        problem, needed = f"shape {mask.shape} (height, width)", f"{like.shape[:2]}, like the goal image"
+        raise InputError(where=where, found=problem, needed=needed)
 
 
 def decode_images(
@@ -85,7 +85,7 @@ def decode_images(
     """Decode PNG or JPEG images to RGB; JPEG is bit for bit equal to TensorFlow's decoder.
 
     Args:
-        images: One or more encoded images of one size. The format is detected from the content.
+        images: Encoded images of one size; none give an empty array. The format is detected from the content.
         steps: Control step of each image, for messages.
         where: File, episode and camera, for messages.
 
@@ -93,7 +93,7 @@ def decode_images(
         InputError: An image is neither PNG nor JPEG, has more than 8 bits a channel, is too large, or has another size
             than the first.
     """
-    decode = decode_image if images[0].startswith(_PNG) else _decode_as_tensorflow
+    decode = decode_image if images and images[0].startswith(_PNG) else _decode_as_tensorflow
     decoded = (decode(image, f"{where}: step {step}") for image, step in zip(images, steps, strict=True))
     return stack_frames(decoded, steps, where)
 
@@ -102,8 +102,8 @@ def _decode_as_tensorflow(image: bytes, where: str) -> UInt8[np.ndarray, "height
     try:
         return _decode_jpeg(image, where, is_fast=True)
     except ValueError as error:
-        found = f"{len(image)} bytes that are not a JPEG, starting with {bytes(image[:4])!r} ({error})"
-        raise InputError(where=where, found=found, needed="a JPEG or PNG image") from None
+        problem = f"{len(image)} bytes that are not a JPEG, starting with {bytes(image[:4])!r} ({error})"
+        raise InputError(where=where, found=problem, needed="a JPEG or PNG image") from None
 
 
 def stack_frames(
@@ -112,7 +112,7 @@ def stack_frames(
     """Stack frames from an iterator that decodes them one after another.
 
     Args:
-        frames: One or more frames of one size.
+        frames: Frames of one size; none give an empty array.
         steps: Control step of each frame, for messages.
         where: File, episode and camera, for messages.
 
@@ -124,10 +124,10 @@ def stack_frames(
         at = f"{where}: step {step}"
         require_decodable_size(frame.shape[0], frame.shape[1], at, count=len(steps))
         if stacked and frame.shape != stacked[0].shape:
-            found, needed = (f"an image of {image.shape[0]}x{image.shape[1]}" for image in (frame, stacked[0]))
-            raise InputError(where=at, found=found, needed=f"{needed}, as at step {steps[0]}")
+            problem, needed = (f"an image of {image.shape[0]}x{image.shape[1]}" for image in (frame, stacked[0]))
+            raise InputError(where=at, found=problem, needed=f"{needed}, as at step {steps[0]}")
         stacked.append(frame)
-    return np.stack(stacked)
+    return np.stack(stacked) if stacked else np.zeros((0, 0, 0, 3), np.uint8)
 
 
 def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95) -> bytes:
@@ -167,14 +167,14 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
             if _EXIF not in data:  # robot cameras write no EXIF; this search takes a thousandth of the decoding time
                 return pixels
             with JpegImageFile(io.BytesIO(data)) as image:  # reads the header only
-                return _upright(pixels, image)
+                return _apply_orientation(pixels, image)
         with PngImageFile(io.BytesIO(data)) as image:  # reads the header only
             require_decodable_size(image.height, image.width, where)
-            return _upright(_as_rgb(image), image)
+            return _apply_orientation(_as_rgb(image), image)
     except (OSError, ValueError, SyntaxError, struct.error, zlib.error, EOFError, IndexError) as error:
-        found = f"{len(data)} bytes that are not an image, starting with {data[:4]!r} ({error})"
+        problem = f"{len(data)} bytes that are not an image, starting with {data[:4]!r} ({error})"
         needed = "a PNG or JPEG image; depth images, such as TIFF, are not supported"
-        raise InputError(where=where, found=found, needed=needed) from None
+        raise InputError(where=where, found=problem, needed=needed) from None
 
 
 def _decode_jpeg(data: bytes, where: str, *, is_fast: bool = False) -> UInt8[np.ndarray, "height width 3"]:
@@ -183,7 +183,9 @@ def _decode_jpeg(data: bytes, where: str, *, is_fast: bool = False) -> UInt8[np.
     return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB", fastdct=is_fast))
 
 
-def _upright(pixels: UInt8[np.ndarray, "height width 3"], image: Image.Image) -> UInt8[np.ndarray, "rows columns 3"]:
+def _apply_orientation(
+    pixels: UInt8[np.ndarray, "height width 3"], image: Image.Image
+) -> UInt8[np.ndarray, "rows columns 3"]:
     """Rotate and mirror pixels according to the EXIF orientation of an image; unreadable EXIF data are ignored."""
     with suppress(OSError, ValueError, SyntaxError, struct.error, LookupError):
         orientation = image.getexif()[ExifTags.Base.Orientation]
@@ -226,7 +228,7 @@ def encode_webp(
 # ---- checks of a camera ----
 
 _BLOCKS = 16  # blocks along each side of an image; averaging over a block removes sensor noise but not the scene
-_MIN_CONTRAST = 1.0  # of 255: below for a covered lens with noise of 10, above for a scene at 5 % of its light
+_MIN_CONTRAST = 1.0  # of 255; a covered lens with noise of 10 is below, a scene at 5 % of its light is above
 _STILL_M, _STILL_RAD = 0.005, math.radians(3.0)  # larger than the noise of the measured states of a still arm
 _STILL_SHARE = 0.5  # the same threshold for vectors, as a share of the largest change in a model step
 
@@ -235,36 +237,36 @@ CameraFrame = tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, " dim
 
 
 def newest_frames(
-    views: Iterable[np.ndarray], state: Float[np.ndarray, " dim"], before: Iterable[CameraFrame]
+    views: Iterable[np.ndarray], state: Float[np.ndarray, " dim"], previous: Iterable[CameraFrame]
 ) -> tuple[CameraFrame, ...]:
     """Return the newest distinct frame of each camera: a repeated image keeps the state of its first appearance.
 
     Args:
         views: The current image of each camera; copied, since a driver may reuse its memory for the next image.
         state: The measured state.
-        before: The previous result; empty after a reset.
+        previous: The previous result; empty after a reset.
     """
-    pairs = zip_longest(views, before)
+    pairs = zip_longest(views, previous)
     return tuple(last if last and np.array_equal(last[0], view) else (view.copy(), state) for view, last in pairs)
 
 
 def has_moved(
-    before: Float[np.ndarray, " dim"],
-    now: Float[np.ndarray, " dim"],
+    earlier: Float[np.ndarray, " dim"],
+    later: Float[np.ndarray, " dim"],
     space: StateSpace,
-    largest: Float[np.ndarray, " dim"],
+    max_change: Float[np.ndarray, " dim"],
 ) -> bool:
     """Return whether two measured states differ by more than the noise of a still robot.
 
     Args:
-        before: The earlier state.
-        now: The later state.
+        earlier: The earlier state.
+        later: The later state.
         space: The space of the states.
-        largest: The largest change of each number in a model step; used for vectors, whose units are unknown.
+        max_change: The largest change of each number in a model step; used for vectors, whose units are unknown.
     """
-    (change,) = space.compute_differences(np.stack([before, now]))
+    (change,) = space.compute_differences(np.stack([earlier, later]))
     if not space.is_pose:
-        return bool(((largest > 0) & (abs(change) > _STILL_SHARE * largest)).any())
+        return bool(((max_change > 0) & (abs(change) > _STILL_SHARE * max_change)).any())
     return float(np.linalg.norm(change[:3])) > _STILL_M or float(rotation_angles(change[None, 3:6])[0]) > _STILL_RAD
 
 
@@ -284,5 +286,5 @@ def require_contrast(views: Iterable[np.ndarray], *, where: str) -> None:
         InputError: A view is uniform.
     """
     if any(map(is_uniform, views)):
-        found, needed = "an image without contrast, as from a black or covered camera", "an image of the scene"
-        raise InputError(where=where, found=found, needed=needed)
+        problem, needed = "an image without contrast, as from a black or covered camera", "an image of the scene"
+        raise InputError(where=where, found=problem, needed=needed)

@@ -92,17 +92,17 @@ def read_frames(
         raise ValueError(f"{where}: steps {list(steps)}")
     with _open_video(file, where) as video:
         if clock is not None:
-            shown = _frame_times_by_clock(video, clock, steps)
+            frame_times = _find_times_by_clock(video, clock, steps)
         else:
-            shown = _frame_times_by_position(steps, video.times() if times is None else times, where)
-        frames = video.decode(sorted(set(shown)))
+            frame_times = _find_times_by_position(steps, video.times() if times is None else times, where)
+        frames = video.decode(sorted(set(frame_times)))
         if len(sizes := {frame.shape for frame in frames.values()}) > 1:
-            found = f"frames of {' and '.join(f'{height}x{width}' for height, width, _ in sorted(sizes))}"
-            raise _video_error(where, found, "frames of one size")
-        return np.stack([frames[time] for time in shown])
+            problem = f"frames of {' and '.join(f'{height}x{width}' for height, width, _ in sorted(sizes))}"
+            raise _video_error(where, problem, "frames of one size")
+        return np.stack([frames[time] for time in frame_times])
 
 
-def _frame_times_by_position(steps: Sequence[int], times: Sequence[int], where: str) -> list[int]:
+def _find_times_by_position(steps: Sequence[int], times: Sequence[int], where: str) -> list[int]:
     if max(steps) >= len(times):
         raise _video_error(where, f"{len(times)} frames", f"at least {max(steps) + 1}")
     if len(set(times)) < len(times):
@@ -110,22 +110,22 @@ def _frame_times_by_position(steps: Sequence[int], times: Sequence[int], where: 
     return [times[step] for step in steps]
 
 
-def _frame_times_by_clock(video: _Video, clock: Clock, steps: Sequence[int]) -> list[int]:
+def _find_times_by_clock(video: _Video, clock: Clock, steps: Sequence[int]) -> list[int]:
     """Return the presentation time of the frame nearest to the time of each step."""
     targets = [round((clock.start_s + step / clock.rate_hz) / video.unit_s) for step in steps]
     if len(set(targets)) < len(set(steps)):
-        found = f"a time unit of {video.unit_s:g} s, which is too coarse for {clock.rate_hz:g} frames per second"
-        raise _video_error(video.where, found, "a different time for each frame")
+        problem = f"a time unit of {video.unit_s:g} s, which is too coarse for {clock.rate_hz:g} frames per second"
+        raise _video_error(video.where, problem, "a different time for each frame")
     nearest = video.nearest_times(sorted(set(targets)), max(0, int(0.49 / clock.rate_hz / video.unit_s)))
     if not (missing := set(targets) - nearest.keys()):
         return [nearest[target] for target in targets]
-    found, rate_hz = f"no frame at {min(missing) * video.unit_s:.3f} s", video.header().rate_hz
+    problem, rate_hz = f"no frame at {min(missing) * video.unit_s:.3f} s", video.header().rate_hz
     if 0 < rate_hz < _SAME_RATE * clock.rate_hz:
-        found += f": the video has {rate_hz:.4g} frames per second, but {clock.source} states {clock.rate_hz:g}"
+        problem += f": the video has {rate_hz:.4g} frames per second, but {clock.source} states {clock.rate_hz:g}"
         fix = "Correct the frame rate of the video or the rate of the steps, or exclude the episode"
-        raise InputError(where=video.where, found=found, needed="a frame for each step", fix=fix)
+        raise InputError(where=video.where, found=problem, needed="a frame for each step", fix=fix)
     needed = f"a frame at each of {len(targets)} times, starting at {min(targets) * video.unit_s:.3f} s"
-    raise _video_error(video.where, found, needed)
+    raise _video_error(video.where, problem, needed)
 
 
 def read_header(file: str | Path | ByteReader, *, where: str) -> VideoHeader:
@@ -164,7 +164,7 @@ def _open_video(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
     try:
         # The demuxer is fixed, because libav would otherwise follow playlists to other files.
         with av.open(source, format="mp4", metadata_errors="replace") as container:
-            yield _Video(container, _stream_of(container, where), av.video.reformatter.VideoReformatter(), where)
+            yield _Video(container, _select_stream(container, where), av.video.reformatter.VideoReformatter(), where)
     except (av.FFmpegError, InputError) as error:
         if source.error is not None:
             raise source.error from None
@@ -175,16 +175,16 @@ def _open_video(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
         raise source.error
 
 
-def _stream_of(container: Any, where: str) -> VideoStream:
+def _select_stream(container: Any, where: str) -> VideoStream:
     stream = container.streams.best("video")
     if stream is None:
         raise _video_error(where, "no video in the file", "an MP4 with frames")
     if stream.codec_context is None:
-        found, fix = "a codec that this build of PyAV cannot decode", "Install PyAV from PyPI, or convert the video"
-        raise InputError(where=where, found=found, needed="H.264, H.265 or AV1", fix=fix)
+        problem, fix = "a codec that this build of PyAV cannot decode", "Install PyAV from PyPI, or convert the video"
+        raise InputError(where=where, found=problem, needed="H.264, H.265 or AV1", fix=fix)
     if is_depth_format(str(stream.pix_fmt)):
-        found = f"frames of {stream.pix_fmt}: one channel of more than 8 bits, as in depth videos"
-        raise InputError(where=where, found=found, needed="a colour video", fix="Choose another camera")
+        problem = f"frames of {stream.pix_fmt}: one channel of more than 8 bits, as in depth videos"
+        raise InputError(where=where, found=problem, needed="a colour video", fix="Choose another camera")
     stream.codec_context.thread_count = 1
     stream.codec_context.options = _DECODER_OPTIONS
     return cast("VideoStream", stream)
@@ -303,15 +303,15 @@ class _Video:
 
     def _packets_before(self, target: int) -> Iterator[Packet[VideoStream]]:
         """Yield packets from the last key frame whose presentation time is at most the target."""
-        sought = target
-        while sought > _START:
-            packets = self.packets(sought)
+        seek_time = target
+        while seek_time > _START:
+            packets = self.packets(seek_time)
             first = next(packets, None)
             if first is not None and first.pts is not None and first.pts <= target:
                 yield first
                 yield from packets
                 return
-            sought = _START if first is None else self._key_frame_before(int(first.dts or 0) - 1)
+            seek_time = _START if first is None else self._key_frame_before(int(first.dts or 0) - 1)
         yield from self.packets()
 
     def _key_frame_before(self, time: int) -> int:
@@ -328,7 +328,7 @@ class _Video:
                 raise _video_error(self.where, f"a damaged frame at {time * self.unit_s:.3f} s", "a whole MP4")
             require_decodable_size(frame.height, frame.width, self.where, count=len(times))
             image = np.asarray(self.converter.reformat(frame, format="rgb24", threads=1).to_ndarray())
-            frames[time] = _upright(image, frame, self.where)
+            frames[time] = _apply_display_matrix(image, frame, self.where)
 
 
 def _nearest(times: Sequence[int], target: int) -> int:
@@ -337,7 +337,9 @@ def _nearest(times: Sequence[int], target: int) -> int:
     return min(times[max(0, index - 1) : index + 1], key=lambda time: abs(time - target), default=_START)
 
 
-def _upright(image: Frame, frame: VideoFrame, where: str) -> UInt8[np.ndarray, "displayed_height displayed_width 3"]:
+def _apply_display_matrix(
+    image: Frame, frame: VideoFrame, where: str
+) -> UInt8[np.ndarray, "displayed_height displayed_width 3"]:
     """Rotate and mirror an image according to its display matrix, with which phones store rotated videos."""
     if not frame.rotation:
         return image
@@ -346,14 +348,14 @@ def _upright(image: Frame, frame: VideoFrame, where: str) -> UInt8[np.ndarray, "
     if matrix[0, 0] == matrix[1, 1] == 0:
         image, matrix = image.swapaxes(0, 1), matrix[::-1]  # x becomes y
     if np.count_nonzero(matrix) != 2 or not matrix.diagonal().all():
-        found = "a display matrix that is not a rotation by a multiple of 90 degrees"
+        problem = "a display matrix that is not a rotation by a multiple of 90 degrees"
         needed = "a rotation by 90, 180 or 270 degrees, or no display matrix"
-        raise InputError(where=where, found=found, needed=needed, fix="Convert the video")
+        raise InputError(where=where, found=problem, needed=needed, fix="Convert the video")
     return image[:: int(np.sign(matrix[1, 1])), :: int(np.sign(matrix[0, 0]))]
 
 
-def _video_error(where: str, found: str, needed: str) -> InputError:
-    return InputError(where=where, found=found, needed=needed, fix=_FIX)
+def _video_error(where: str, problem: str, needed: str) -> InputError:
+    return InputError(where=where, found=problem, needed=needed, fix=_FIX)
 
 
 def import_pyav(where: str = "video") -> Any:

@@ -58,7 +58,8 @@ class Cameras:
     ) -> tuple[tuple[CameraFrame, ...], Fault | None]:
         """Return the latest frame of each camera, and the fault for which the robot must not move; None: no fault.
 
-        A fault of one camera is enough. The controller sets `latest_frames` after the decision, not this method.
+        A fault of one camera is enough. This method does not change `latest_frames`; the controller sets it after a
+        decision.
 
         Args:
             frame: The current frame, with the views of all cameras side by side.
@@ -69,7 +70,7 @@ class Cameras:
         latest_frames = newest_frames(split_views(frame[None], self.views), state, self.latest_frames)
         if any(map(is_uniform, self._crop_views(frame))):
             return latest_frames, "uniform frame"
-        is_frozen = any(has_moved(before, state, space, max_change) for _, before in latest_frames)
+        is_frozen = any(has_moved(frame_state, state, space, max_change) for _, frame_state in latest_frames)
         return latest_frames, "frozen frame" if is_frozen else None
 
     def compute_patch_weights(self, mask: np.ndarray | None, like: Image) -> Float[Tensor, " tokens"] | None:
@@ -104,11 +105,11 @@ def require_views(config: DataConfig, views: int, *, to: str = "make goals") -> 
     """
     require_frames(config, to=to)
     if len(config.cameras) < views:
-        found, needed = (
-            ", ".join(config.cameras),
-            f"{views} cameras, from left to right, because planning.views is {views}",
+        raise InputError(
+            where="data.camera",
+            found=", ".join(config.cameras),
+            needed=f"{views} cameras, from left to right, because planning.views is {views}",
         )
-        raise InputError(where="data.camera", found=found, needed=needed)
 
 
 def read_views(

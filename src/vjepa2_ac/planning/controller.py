@@ -54,9 +54,9 @@ class Surprise:
 
 
 PriorStart = Callable[[WorldModelCost, Latents, int, SearchSpace], PlanStart]
-"""Returns where a search towards the latents of a goal starts, with a number of model steps left (`planning.prior`)."""
+"""Returns the start of a search towards a goal's latents, given the number of model steps left (`planning.prior`)."""
 Compare = Callable[[Latents, Latents], Surprise]
-"""Returns the difference between a predicted frame and the frame (`planning.monitor`)."""
+"""Compares the latents of a predicted frame with those of the frame (`planning.monitor`)."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Decision:
     """An action for the next model step, and the reason for it."""
 
     action: Float[np.ndarray, " dim"]  # for the next model step; zero for some values of `why`
-    # "out of time": the best plan so far. The action is zero for all other values except "planned". "uniform frame":
+    # "planned", or "out of time" with the best plan so far. For all other values the action is zero. "uniform frame":
     # the image of a camera has no contrast. "frozen frame": an image equals the previous one, although the robot moved.
     why: Reason
     current_energy: float  # energy if the image stayed as it is, to compare with the plan's; NaN for a faulty frame
@@ -126,15 +126,13 @@ class Controller:
         self._camera_pose = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
         self._energy = EnergyFunction.from_config(self.config.energy)
         self._load_files(world_model)
-        self.space = make_search_space(
-            self.config, spaces.state
-        )  # the allowed changes of the state, of the last decision
+        self.space = make_search_space(self.config, spaces.state)  # the search space of the latest decision
         self.planner = Planner(self.config, self.space)
         self._workspace = Workspace.from_limits(self.config.limits, spaces.state)
         self._search_spaces: dict[GripperMode | None, SearchSpace] = {None: self.space}
         self._goals: tuple[SubGoal, ...] = ()
         self._progress: GoalProgress | None = None  # at the last usable frame
-        self._done = 0
+        self._num_decisions = 0  # since the reset
         self.decision: Decision | None = None  # the latest decision
 
     def _load_files(self, world_model: WorldModel) -> None:
@@ -225,7 +223,7 @@ class Controller:
     def follow(
         self, goals: Sequence[SubGoal], *, mask: np.ndarray | None = None, cancelled: Cancelled = lambda: False
     ) -> None:
-        """Set goals that apply one after another, each until its own rule is met, and forget all observations.
+        """Set goals that apply one after another, each until its rule is met, and forget all observations.
 
         A goal applies for at least `at_least` and at most `at_most` model steps. Between these bounds the next goal
         follows as soon as the energy of the current image is below `share` times its energy when the goal began.
@@ -238,7 +236,7 @@ class Controller:
             cancelled: Called before each goal is encoded; returns whether to stop.
 
         Raises:
-            SearchCancelledError: `cancelled` returned true; the previous goals current_energies apply.
+            SearchCancelledError: `cancelled` returned true; the previous goals still apply.
             InputError: An image is invalid, sizes differ, the mask is empty, a goal has no end, the last goal has a
                 bound, or a gripper mode is set for a robot whose states are vectors, or leaves no free component.
             ValueError: No goals.
@@ -259,7 +257,7 @@ class Controller:
         weights = self.cameras.compute_patch_weights(mask, goals[0].image)
         self._goals, self._goal_latents, self._patch_weights = tuple(goals), torch.stack(latents), weights
         self._search_spaces, self.space = search_spaces, search_spaces[None]
-        self.cameras.latest_frames, self._progress, self._done, self.decision = (), None, 0, None
+        self.cameras.latest_frames, self._progress, self._num_decisions, self.decision = (), None, 0, None
 
     def act(
         self,
@@ -296,7 +294,11 @@ class Controller:
         else:
             decision = self._decide_without_motion(state, fault)
         # Set after all calls that can raise, so that an error leaves the controller unchanged.
-        self.cameras.latest_frames, self._done, self.decision = latest_frames, self._done + 1, decision
+        self.cameras.latest_frames, self._num_decisions, self.decision = (
+            latest_frames,
+            self._num_decisions + 1,
+            decision,
+        )
         return decision.action
 
     @torch.no_grad()
@@ -373,7 +375,7 @@ class Controller:
 
         if self._progress is None:
             return GoalProgress(0, 0, energy(0))
-        return self._progress.advance(self._goals, self._done, energy)
+        return self._progress.advance(self._goals, self._num_decisions, energy)
 
     def _get_goal(self, index: int) -> Goal:
         """Return a goal and the later goals that a long plan can reach, with `at_most` as the durations."""
@@ -388,31 +390,28 @@ class Controller:
         self, latents: Latents, progress: GoalProgress, steps: int
     ) -> tuple[Float[Tensor, " steps"], tuple[int, ...]]:
         """Return the distance of the current image from the goal of each of the next steps, and the goals' indices."""
-        goal, done = self._get_goal(progress.goal_index), self._done - progress.start_step
+        goal, done = self._get_goal(progress.goal_index), self._num_decisions - progress.start_step
         goal_latents = goal.get_latents(done, steps)
         current_energies = distance(latents.expand_as(goal_latents), goal_latents, self._energy, goal.weights)
         return current_energies, tuple(progress.goal_index + goal.get_index(done + step) for step in range(steps))
 
     def _make_cost(self, latents: Latents, state: State, progress: GoalProgress) -> WorldModelCost:
-        goal, done = self._get_goal(progress.goal_index), self._done - progress.start_step
+        goal, done = self._get_goal(progress.goal_index), self._num_decisions - progress.start_step
         scene = Scene(latents, torch.from_numpy(state).float(), self._camera_pose, self._axes, self.config.views)
         return WorldModelCost(self._model, scene, goal, self._energy, done=done, spaces=self.spaces)
 
     def _combine_steps(self, distances: Float[Tensor, " steps"]) -> float:
         return float(distances[-1] if self.config.energy.steps == "last" else distances.sum())
 
-    def _decide(
-        self,
-        latents: Latents,
-        state: State,
-        samples: np.ndarray | None,
-        cancelled: Cancelled,
-    ) -> Decision:
+    def _decide(self, latents: Latents, state: State, samples: np.ndarray | None, cancelled: Cancelled) -> Decision:
+        """Return the decision at a usable frame: a plan, or a zero action if no motion is needed or possible."""
         progress = self._update_progress(latents)
         current_energies, goal_indices = self._compute_current_energies(latents, progress, self.config.horizon)
         energy = self._combine_steps(current_energies)
         command = self._get_command(state, np.zeros(len(state)))
-        zero_action = Decision(command, "at the goal", energy, goal_indices, progress, surprise=self._surprise(latents))
+        zero_action = Decision(
+            command, "at the goal", energy, goal_indices, progress, surprise=self._measure_surprise(latents)
+        )
         if progress.is_done or float(current_energies.max()) <= REACHED:
             return replace(zero_action, is_done=progress.goal_index == len(self._goals) - 1)
         if self._workspace is not None and not is_within_limits(
@@ -422,26 +421,25 @@ class Controller:
         self.space = self._search_spaces[self._goals[progress.goal_index].gripper]
         cost = self._make_cost(latents, state, progress)
         plan = self._search(state, cost, self._get_start(cost, progress, samples), cancelled)
+        states = integrate_changes(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)
         why: Reason = "planned" if plan.stopped == "finished" else plan.stopped
         return replace(
             zero_action,
             action=self._get_command(state, plan.actions[0].double().numpy()),
             why=why,
             plan=plan,
-            states=integrate_changes(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[
-                0
-            ].numpy(),
+            states=states[0].numpy(),
             cost=cost,
             from_samples=samples is not None,
         )
 
-    def _surprise(self, latents: Latents) -> Surprise | None:
+    def _measure_surprise(self, latents: Latents) -> Surprise | None:
         """Return the difference between the current frame and the prediction of the last decision."""
-        before = self.decision
-        if self._compare is None or before is None or before.cost is None or before.plan is None:
+        previous = self.decision
+        if self._compare is None or previous is None or previous.cost is None or previous.plan is None:
             return None
         with torch.no_grad():
-            predicted, _ = before.cost.rollout(before.plan.actions[None, :1])
+            predicted, _ = previous.cost.rollout(previous.plan.actions[None, :1])
         return self._compare(predicted[0, 0], latents)
 
     def _get_start(self, cost: WorldModelCost, progress: GoalProgress, samples: np.ndarray | None) -> PlanStart | None:
@@ -450,14 +448,14 @@ class Controller:
             return PlanStart.from_samples(torch.from_numpy(np.array(samples, dtype=np.float64)), self.space)
         if self._prior_start is not None:
             bound = self._goals[progress.goal_index].at_most
-            steps_left = _PRIOR_STEPS if bound is None else bound - (self._done - progress.start_step)
+            steps_left = _PRIOR_STEPS if bound is None else bound - (self._num_decisions - progress.start_step)
             return self._prior_start(cost, self._goal_latents[progress.goal_index], steps_left, self.space)
         last_plan = None if self.decision is None else self.decision.plan
         return last_plan.make_next_start() if last_plan is not None and self.config.warm_start else None
 
     def _search(self, state: np.ndarray, cost: WorldModelCost, start: PlanStart | None, cancelled: Cancelled) -> Plan:
         """Return the plan of a search, kept inside the workspace if there is one, with the energy of its actions."""
-        generator, workspace = torch.Generator().manual_seed(self.seed + self._done), self._workspace
+        generator, workspace = torch.Generator().manual_seed(self.seed + self._num_decisions), self._workspace
         space = self.space if workspace is None else workspace.narrow(self.space, state)
         plan = self.planner.plan(cost, generator, start, cancelled, space)
         if workspace is None or plan.stopped == "no finite energy":
@@ -481,13 +479,11 @@ class Controller:
             return self._search_spaces[None]
         where, fix = f"gripper mode {gripper!r} of a goal", "Remove the gripper mode of the goal"
         if not self.spaces.state.is_pose:
-            found = "a model with vector states, whose gripper is unknown"
-            raise InputError(where=where, found=found, fix=fix)
+            raise InputError(where=where, found="a model with vector states, whose gripper is unknown", fix=fix)
         limits = self.config.limits.model_copy(update={"gripper_mode": gripper})
         space = make_search_space(self.config.model_copy(update={"limits": limits}), self.spaces.state)
         if not len(space.free):
-            found = "no free component: planning.limits fix position and rotation"
-            raise InputError(where=where, found=found, fix=fix)
+            raise InputError(where=where, found="no free component: planning.limits fix position and rotation", fix=fix)
         return space
 
     def _get_command(self, state: np.ndarray, change: np.ndarray) -> Float[np.ndarray, " action_dim"]:
@@ -503,9 +499,9 @@ def _load_axes(path: str, fingerprints: Fingerprints) -> Axes:
     """
     axes = read_axes(path)
     if (axes.encoder, axes.predictor) != (fingerprints.encoder, fingerprints.predictor):
-        found = f"axes that were calibrated for another model, {axes.subject}"
+        problem = f"axes that were calibrated for another model, {axes.subject}"
         fix = "Calibrate them for this model: `vjepa2-ac data calibrate CONFIG --axes MODEL`"
-        raise InputError(where=f"planning.axes: {path}", found=found, fix=fix)
+        raise InputError(where=f"planning.axes: {path}", found=problem, fix=fix)
     return Axes(math.radians(axes.yaw_degrees), axes.centre_m)
 
 
@@ -513,8 +509,8 @@ def _require_camera_pose(model: WorldModel, extrinsics: np.ndarray | None, views
     if extrinsics is not None:
         EXTRINSICS.require_state(extrinsics, "extrinsics")
     if (uses := model.sizes.predictor.use_extrinsics) != (extrinsics is not None):
-        found, needed = f"{uses}, camera pose given: {not uses}", "a camera pose if and only if the model uses it"
-        raise InputError(where="model: predictor.use_extrinsics", found=found, needed=needed)
+        problem, needed = f"{uses}, camera pose given: {not uses}", "a camera pose if and only if the model uses it"
+        raise InputError(where="model: predictor.use_extrinsics", found=problem, needed=needed)
     if uses and views > 1:
         raise InputError(
             where="planning.views", found=f"{views} views, with a model that uses the camera pose", needed="1"
@@ -526,6 +522,6 @@ def _require_spaces(model: WorldModel, spaces: Spaces) -> None:
         needed = f"{spaces.widths.state} and {spaces.widths.action}, as the spaces of the data that it was trained on"
         raise InputError(where="model", found=describe_model_widths(model.sizes), needed=needed)
     if spaces.action.follows == "unknown":
-        found = "recorded actions whose effect on the state is unknown"
+        problem = "recorded actions whose effect on the state is unknown"
         fix = "To plan, train with data.actions: difference, or with data.join_actions: sum or last"
-        raise InputError(where="data.actions: recorded", found=found, fix=fix)
+        raise InputError(where="data.actions: recorded", found=problem, fix=fix)

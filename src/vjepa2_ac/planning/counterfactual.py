@@ -28,7 +28,7 @@ _DIRECTIONS: dict[str, tuple[int, float]] = {  # in the robot base frame: x to t
     "open": (6, -1.0), "close": (6, 1.0),
 }  # fmt: skip
 ACTION_NAMES = ("none", *_DIRECTIONS)
-_MAX_ACTION = np.array([1.0] * 3 + [np.pi] * 3 + [1.0])  # metres, radians, closedness in one step: more are other units
+_MAX_ACTION = np.array([1.0] * 3 + [np.pi] * 3 + [1.0])  # metres, radians, closedness; larger: wrong units
 
 
 def make_named_actions(
@@ -69,11 +69,11 @@ def make_named_actions(
     else:
         size = 0.0 if limits.gripper_mode == "held" else limits.gripper
     if size == 0:
-        key, found, needed = "gripper" if axis == GRIPPER else "xyz", "0", "a limit above 0"
+        key, problem, needed = "gripper" if axis == GRIPPER else "xyz", "0", "a limit above 0"
         if axis == GRIPPER and limits is not None and limits.gripper_mode == "held":
-            key, found, needed = "gripper_mode", "held", "rounded or free"
+            key, problem, needed = "gripper_mode", "held", "rounded or free"
         where = f"planning.limits.{key}"
-        raise InputError(where=where, found=f"{found}, so that no action can move {name}", needed=needed)
+        raise InputError(where=where, found=f"{problem}, so that no action can move {name}", needed=needed)
     actions[:, axis] = sign * size
     return actions
 
@@ -93,23 +93,23 @@ def read_actions(path: str | Path, *, steps: int | None = None) -> Float[np.ndar
     """
     needed = f"one line of {ACTION_DIM} numbers for each model step: {', '.join(POSE_CHANGE.names)}"
     fix = "Use metres, radians and closedness changes from -1 to 1, in a NumPy .npy file or a comma-separated .csv file"
-    refused = partial(InputError, where=str(path), needed=needed, fix=fix)
+    invalid_file = partial(InputError, where=str(path), needed=needed, fix=fix)
     try:
         if str(path).lower().endswith(".npy"):
             with Path(path).open("rb") as file:
                 actions = np.asarray(np.lib.format.read_array(file, allow_pickle=False), dtype=np.float64)
         else:
             lines = [line for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip()]
-            names = bool(lines) and lines[0].replace(" ", "") == ",".join(POSE_CHANGE.names)
-            actions = np.loadtxt(lines[names:], delimiter=",", ndmin=2)
+            has_header = bool(lines) and lines[0].replace(" ", "") == ",".join(POSE_CHANGE.names)
+            actions = np.loadtxt(lines[has_header:], delimiter=",", ndmin=2)
     except (OSError, ValueError, TypeError) as error:
-        raise refused(found=f"cannot be read ({error})") from None
+        raise invalid_file(found=f"cannot be read ({error})") from None
     if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not len(actions):
-        raise refused(found=f"an array of shape {actions.shape}")
-    wrong = ~(np.abs(actions) <= _MAX_ACTION).all(axis=1)  # NaN is wrong, too
-    if wrong.any():
-        step = int(wrong.argmax())
-        raise refused(found=f"action {step} is {np.array2string(actions[step], precision=4, max_line_width=200)}")
+        raise invalid_file(found=f"an array of shape {actions.shape}")
+    is_invalid = ~(np.abs(actions) <= _MAX_ACTION).all(axis=1)  # NaN is invalid, too
+    if is_invalid.any():
+        step = int(is_invalid.argmax())
+        raise invalid_file(found=f"action {step} is {np.array2string(actions[step], precision=4, max_line_width=200)}")
     if steps is not None and len(actions) < steps:
         raise InputError(where=str(path), found=f"{len(actions)} actions", needed=f"{steps}, one for each model step")
     return actions[:steps]

@@ -26,7 +26,7 @@ from vjepa2_ac.storage.structured import format_json, to_plain
 
 @dataclass(frozen=True, eq=False)
 class PlanRequest:
-    """The observation and the goal."""
+    """The input of a planning decision: the observation and the goals."""
 
     start: UInt8[np.ndarray, "height width 3"]
     state: Float[np.ndarray, " numbers"]  # measured; the controller checks it
@@ -35,7 +35,7 @@ class PlanRequest:
 
     @property
     def durations(self) -> list[int]:
-        """Number of model steps of each goal but the last, if all these numbers are fixed; else empty."""
+        """Number of model steps of each goal except the last; empty unless all these numbers are fixed."""
         all_but_last = self.goals[:-1]
         is_fixed = all(goal.at_least == goal.at_most for goal in all_but_last)
         return [goal.at_least for goal in all_but_last] if is_fixed else []
@@ -99,11 +99,11 @@ def decide(controller: Controller, request: PlanRequest, *, nodes: int = 0, repo
     decision = controller.decision
     if decision is None:
         raise ValueError("the controller made no decision")
-    plan, space, still = decision.plan, controller.space, np.nan
+    plan, space, zero_action_energy = decision.plan, controller.space, np.nan
     slices: tuple[EnergySlice, ...] = ()
     if plan is not None and decision.cost is not None:
         with torch.no_grad():
-            still = float(decision.cost(torch.zeros_like(plan.actions)[None])[0])
+            zero_action_energy = float(decision.cost(torch.zeros_like(plan.actions)[None])[0])
         axes = controller.display_axes
         if decision.why != "no finite energy" and nodes >= 3 and len(axes) >= 2:
             task = reporter.task("energy maps", "action sequences")
@@ -115,7 +115,7 @@ def decide(controller: Controller, request: PlanRequest, *, nodes: int = 0, repo
         decision=decision,
         actions=np.zeros((space.steps, space.dim)) if plan is None else plan.actions.double().numpy(),
         states=np.tile(request.state, (space.steps + 1, 1)) if decision.states is None else decision.states,
-        zero_action_energy=still,
+        zero_action_energy=zero_action_energy,
         slices=slices,
         seconds=dict(zip(("goals", "decision", "slices"), np.diff(times).tolist(), strict=True)),
     )
@@ -124,7 +124,7 @@ def decide(controller: Controller, request: PlanRequest, *, nodes: int = 0, repo
 PLAN_FILE = "plan.json"
 FORMAT = 1  # incremented when a reader of the file would have to change
 
-_AT_LIMIT = 0.98  # an action counts as being at its limit from this share of it
+_AT_LIMIT = 0.98  # an action of at least this share of its limit counts as being at the limit
 
 
 def write_plan(result: PlanResult, about: Mapping[str, Any], path: Path) -> Path:
@@ -194,17 +194,17 @@ def summarize(result: PlanResult) -> str:
             "Zero action: the model gives no finite energy for any of"
             f" {plan.evaluations:,} action sequences. Use another checkpoint."
         )
-    rounds = len(plan.iterations)
-    searched = f"{counted(plan.evaluations, 'action sequence')} in {counted(rounds, 'iteration')}"
+    iterations = len(plan.iterations)
+    effort = f"{counted(plan.evaluations, 'action sequence')} in {counted(iterations, 'iteration')}"
     sentences = [
         _describe_motion(result),
         f"Energy {now:.4f} now, {plan.energy:.4f} predicted for the plan{_relative_change(plan.energy, now)},",
         f"{result.zero_action_energy:.4f} predicted for the zero action.",
-        f"Planner {plan.planner}, seed {plan.seed}: {searched}, {result.seconds['decision']:.2f} s.",
+        f"Planner {plan.planner}, seed {plan.seed}: {effort}, {result.seconds['decision']:.2f} s.",
     ]
     if plan.stopped == "out of time":
         sentences.append(
-            f"The time budget ended the search after {rounds} of {result.controller.config.iterations} iterations."
+            f"The time budget ended the search after {iterations} of {result.controller.config.iterations} iterations."
         )
     if at_limit := find_axes_at_limit(result):
         key = f"planning.limits.{'xyz' if result.state_space.is_pose else 'axes'}"

@@ -35,14 +35,14 @@ SAME_ENERGY = 1e-6  # energies with a smaller relative difference are equal up t
 
 @dataclass(frozen=True)
 class Goal:
-    """Goal latents in order: each applies for its number of model steps, the last one without a bound."""
+    """Latents of one or more goals in order. Each goal applies for its duration, the last goal without a bound."""
 
     latents: Float[Tensor, "goals tokens dim"]
-    durations: tuple[int, ...] = ()  # model steps of each goal but the last
-    weights: Weights | None = None  # None: equal ones
+    durations: tuple[int, ...] = ()  # number of model steps of each goal except the last
+    weights: Weights | None = None  # of the patches; None: equal weights
 
     def get_index(self, step: int) -> int:
-        """Return the index of the goal that applies after this many model steps since the start."""
+        """Return the index of the goal that applies `step` model steps after the start."""
         for index, duration in enumerate(self.durations):
             step -= duration
             if step < 0:
@@ -83,7 +83,7 @@ class Axes:
     The search is over actions in the robot's axes, so the limits hold for the executed actions. The model receives each
     action and state rotated.
 
-    Source: arXiv 2506.09985, appendix B.4, which rotates inferred moves by a measured angle.
+    Source: arXiv 2506.09985, appendix B.4, which rotates inferred motions by a measured angle.
     """
 
     yaw: float  # radians, counterclockwise seen from above
@@ -125,18 +125,16 @@ class Scene:
         self, actions: Float[Tensor, "*batch action_dim"], states: Float[Tensor, "*batch state_dim"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch state_dim"]]:
         """Return actions and states as the model receives them: rotated to the calibrated axes, if there are any."""
-        return (
-            (actions, states)
-            if self.axes is None
-            else (self.axes.rotate_actions(actions), self.axes.rotate_poses(states))
-        )
+        if self.axes is None:
+            return actions, states
+        return self.axes.rotate_actions(actions), self.axes.rotate_poses(states)
 
     @property
     def camera(self) -> Float[Tensor, " 6"] | None:
         """Pose of the camera as the model receives it."""
-        return (
-            self.extrinsics if self.axes is None or self.extrinsics is None else self.axes.rotate_poses(self.extrinsics)
-        )
+        if self.axes is None or self.extrinsics is None:
+            return self.extrinsics
+        return self.axes.rotate_poses(self.extrinsics)
 
 
 @dataclass(frozen=True)
@@ -184,12 +182,8 @@ class WorldModelCost:
         if world_model.predictor.training:
             raise ValueError("the model is in training mode, so dropout would change the energies; call eval() first")
         device = world_model.device
-        self._model, self._energy, self._spaces, self._done = (
-            world_model,
-            EnergyFunction.from_config(energy),
-            spaces,
-            done,
-        )
+        self._model, self._energy = world_model, EnergyFunction.from_config(energy)
+        self._spaces, self._done = spaces, done
         weights = None if goal.weights is None else goal.weights.to(device)
         self._goal = Goal(goal.latents.to(device), goal.durations, weights)
         self._frame, self._state = scene.latents.to(device), scene.state.to(device)
@@ -208,9 +202,10 @@ class WorldModelCost:
         energies: list[Tensor] = []
         done = 0
         for part in parts:
-            energies.append(
-                checkpoint(self._energies, part, use_reentrant=False) if recompute else self._energies(part)
-            )
+            if recompute:
+                energies.append(checkpoint(self._compute_energies, part, use_reentrant=False))
+            else:
+                energies.append(self._compute_energies(part))
             done += len(part)
             self.progress(done, len(actions))
         return torch.cat(energies).to(actions.device)
@@ -232,13 +227,13 @@ class WorldModelCost:
         dim = self._frame.shape[-1]
         views = self._frame.reshape(1, self.views, -1, dim)
         frame = views.expand(samples, -1, -1, -1).flatten(0, 1)[:, None]
-        inputs, before = (
+        inputs, states_before = (
             values.repeat_interleave(self.views, dim=0) for values in self._to_model_axes(inputs, states[:, :-1])
         )
-        predicted = self._model.rollout(frame, inputs, before, camera)
+        predicted = self._model.rollout(frame, inputs, states_before, camera)
         return predicted.reshape(samples, self.views, steps, -1, dim).transpose(1, 2).flatten(2, 3), states
 
-    def _energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
+    def _compute_energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
         predicted, _ = self.rollout(actions)
         target = self._goal.get_latents(self._done, actions.shape[1])
         if self._energy.config.steps == "last":
@@ -271,7 +266,7 @@ def mean_square(predicted: Latents, target: Target) -> TokenDistances:
     return squared_difference(predicted, target).mean(dim=-1)
 
 
-def one_minus_cosine(predicted: Latents, target: Target) -> TokenDistances:
+def cosine_distance(predicted: Latents, target: Target) -> TokenDistances:
     """Return 1 - cosine of each token."""
     return 1 - cosine_similarity(predicted, target, dim=-1)
 

@@ -44,12 +44,12 @@ class SubGoal:
     def __post_init__(self) -> None:
         where = f"goal {self.name!r}" if self.name else "goal"
         if self.at_least < 1 or (self.at_most is not None and self.at_most < self.at_least):
-            found = f"at least {self.at_least} and at most {self.at_most} steps"
-            raise InputError(where=where, found=found, needed="1 <= at_least <= at_most")
+            problem = f"at least {self.at_least} and at most {self.at_most} steps"
+            raise InputError(where=where, found=problem, needed="1 <= at_least <= at_most")
         if self.share is not None and not 0.0 < self.share < 1.0:
             raise InputError(where=where, found=f"share {self.share}", needed="a number between 0 and 1, or none")
 
-    def why_reached(self, energy: float, initial_energy: float) -> str:
+    def explain_reached(self, energy: float, initial_energy: float) -> str:
         """Return why the goal counts as reached at an energy; empty: not reached.
 
         `initial_energy` is the energy when the goal began to apply.
@@ -62,7 +62,7 @@ class SubGoal:
 
 
 def split_horizon(horizon: int, goals: int) -> tuple[int, ...]:
-    """Return equal durations, in model steps, for all goals of a plan but the last, which gets the rest."""
+    """Return equal durations, in model steps, for all goals of a plan except the last, which gets the rest."""
     return (max(1, horizon // goals),) * (goals - 1)
 
 
@@ -95,8 +95,8 @@ def require_goal_ends(goals: Sequence[SubGoal], *, first: int = 0) -> None:
         if goal.at_most is None and goal.share is None:
             raise InputError(where=f"goal {number}", found="a goal without an end", needed="at_most or share")
     if last.at_most is not None:
-        found = f"at_most {last.at_most} for the last goal, which has no next goal"
-        raise InputError(where=f"goal {len(all_but_last) + first}", found=found, needed="null (no bound)")
+        problem = f"at_most {last.at_most} for the last goal, which has no next goal"
+        raise InputError(where=f"goal {len(all_but_last) + first}", found=problem, needed="null (no bound)")
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class GoalProgress:
         if self.is_done or steps < goal.at_least:
             return unchanged
         now, is_last = energy(self.goal_index), self.goal_index == len(goals) - 1
-        why = goal.why_reached(now, self.initial_energy)
+        why = goal.explain_reached(now, self.initial_energy)
         if not why and goal.at_most is not None and steps >= goal.at_most and not is_last:
             why = f"the limit of {counted(goal.at_most, 'step')} is reached, at energy {now:.4g}"
             if self.initial_energy > 0 and math.isfinite(now):
@@ -174,7 +174,7 @@ def read_goal_folder(folder: Path) -> tuple[SubGoal, ...]:
     content = parse_record(_GoalsFile, read_json_object(path, needed=needed), where=str(path), needed=needed)
     goals: list[SubGoal] = []
     for number, entry in enumerate(content.goals, start=1):
-        image_path = _path_of(entry, folder, where=f"{path}: goal {number}")
+        image_path = _resolve_image_path(entry, folder, where=f"{path}: goal {number}")
         image = read_image(image_path)
         require_image(image, where=str(image_path), like=goals[0].image if goals else None)
         require_contrast([image], where=str(image_path))
@@ -185,7 +185,7 @@ def read_goal_folder(folder: Path) -> tuple[SubGoal, ...]:
     return tuple(goals)
 
 
-def _path_of(entry: GoalEntry, folder: Path, *, where: str) -> Path:
+def _resolve_image_path(entry: GoalEntry, folder: Path, *, where: str) -> Path:
     """Return the path of a goal's image; refuse paths outside the folder, since goals.json may be untrusted.
 
     Raises:
@@ -193,7 +193,9 @@ def _path_of(entry: GoalEntry, folder: Path, *, where: str) -> Path:
     """
     name, root = Path(entry.file), os.path.realpath(folder)
     is_local = entry.file.isprintable() and not name.is_absolute() and ".." not in name.parts
-    if not is_local or not Path(os.path.realpath(folder / name)).is_relative_to(root):  # a link may lead out of it
+    if not is_local or not Path(os.path.realpath(folder / name)).is_relative_to(
+        root
+    ):  # a symbolic link may lead outside
         raise InputError(
             where=where, found=f"the file {entry.file!r}", needed="a printable path to a file in the folder"
         )

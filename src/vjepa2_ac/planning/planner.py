@@ -67,20 +67,20 @@ def report_progress(cost: Cost, progress: Progress, *, done: int, share: int, to
         cost: The cost that is evaluated.
         progress: Called with the number of evaluated action sequences and the total.
         done: Number before this evaluation.
-        share: Number that this evaluation adds, however many action sequences it has.
+        share: Number that this evaluation adds to `done`; it may differ from its number of action sequences.
         total: Number for all evaluations.
     """
 
-    def evaluated(part: int, of: int) -> None:
-        if part < of:  # the end is reported after the `with` block, when the energies have been computed
-            progress(done + share * part // of, total)
+    def report_part(part: int, part_total: int) -> None:
+        if part < part_total:  # the end is reported after the `with` block, when the energies have been computed
+            progress(done + share * part // part_total, total)
 
     parts: Any = cost if hasattr(cost, "progress") else SimpleNamespace(progress=no_progress)
-    before, parts.progress = parts.progress, evaluated
+    previous, parts.progress = parts.progress, report_part
     try:
         yield
     finally:
-        parts.progress = before
+        parts.progress = previous
     progress(done + share, total)
 
 
@@ -111,9 +111,9 @@ class Iteration:
 class Plan:
     """The planned actions, and a record of their search."""
 
-    actions: Float[Tensor, "steps dim"]  # always within the limits
-    energy: float  # of these actions; NaN with "no finite energy"
-    stopped: Stopped  # with "no finite energy" the actions are zero
+    actions: Float[Tensor, "steps dim"]  # always within the limits; zero if `stopped` is "no finite energy"
+    energy: float  # of these actions; NaN if `stopped` is "no finite energy"
+    stopped: Stopped  # why the search ended
     iterations: tuple[Iteration, ...]
     mean: Float[Tensor, "decisions dim"]  # final mean of the search, before the gripper is rounded
     repeat: int  # model steps for which each decision is repeated
@@ -129,10 +129,10 @@ class Plan:
         model steps can belong to two decisions of this plan. The last action is repeated.
         """
         elites = self.iterations[-1].elites if self.iterations else self.mean[None][:0]
-        return PlanStart(_shift_by_one_step(self.mean[None], self.repeat)[0], _shift_by_one_step(elites, self.repeat))
+        return PlanStart(_shift_by_step(self.mean[None], self.repeat)[0], _shift_by_step(elites, self.repeat))
 
 
-def _shift_by_one_step(decisions: Samples, repeat: int) -> Samples:
+def _shift_by_step(decisions: Samples, repeat: int) -> Samples:
     steps = decisions.shape[1] * repeat
     indices = (torch.arange(steps) + 1).clamp(max=steps - 1) // repeat
     return reduce(
@@ -201,7 +201,8 @@ class Planner:
             SearchCancelledError: `cancelled` returned true.
             ValueError: The cost does not return one number per sample.
         """
-        began, config, space = self.clock(), self.config, space or self.space or make_pose_search_space(self.config)
+        started_s, config = self.clock(), self.config
+        space = space or self.space or make_pose_search_space(config)
         search = _make_solver(config, space, generator, start)
         record: list[Iteration] = []
         shares = _count_samples(search, config)
@@ -209,7 +210,7 @@ class Planner:
         self.progress(0, total)
         while len(record) < len(shares):
             longest = max((iteration.seconds for iteration in record), default=0.0)
-            if record and config.budget_s is not None and self.clock() - began + longest > config.budget_s:
+            if record and config.budget_s is not None and self.clock() - started_s + longest > config.budget_s:
                 break
             if cancelled():
                 raise SearchCancelledError
@@ -231,17 +232,17 @@ class Planner:
             planner=config.planner.name,
             seed=generator.initial_seed(),
             evaluations=sum(iteration.samples for iteration in record) + evaluated,
-            seconds=self.clock() - began,
+            seconds=self.clock() - started_s,
         )
 
     def _run_iteration(self, search: Solver, cost: Cost, space: SearchSpace) -> Iteration:
-        began = self.clock()
+        started_s = self.clock()
         decisions = search.sample()
         plans = _evaluate(cost, decisions, space, gradients=search.uses_gradients)
         best = plans.select_best(search.elites)
         search.update(plans)
         counts = len(decisions), len(plans.energies)
-        return Iteration(*counts, best.decisions, best.energies, search.mean, search.std, self.clock() - began)
+        return Iteration(*counts, best.decisions, best.energies, search.mean, search.std, self.clock() - started_s)
 
 
 def _evaluate(cost: Cost, decisions: Samples, space: SearchSpace, *, gradients: bool) -> EvaluatedPlans:
@@ -260,7 +261,7 @@ def _evaluate(cost: Cost, decisions: Samples, space: SearchSpace, *, gradients: 
 
 
 def _select_plan(
-    answer: Tensor | None, record: list[Iteration], cost: Cost, space: SearchSpace, *, lowest: bool
+    result: Tensor | None, record: list[Iteration], cost: Cost, space: SearchSpace, *, lowest: bool
 ) -> tuple[Float[Tensor, "steps dim"] | None, float, int]:
     """Return actions, their energy, and the number of extra evaluations.
 
@@ -270,7 +271,7 @@ def _select_plan(
     best_iteration = min(record, key=lambda iteration: iteration.lowest)
     best = best_iteration.elites[0] if len(best_iteration.elites) else None
     chosen, lowest_energy, evaluated = None, math.nan, 0
-    for decisions in (answer, best):
+    for decisions in (result, best):
         if decisions is None or (chosen is not None and not lowest):
             continue
         finished, energies = space.finalize(decisions), [best_iteration.lowest]

@@ -98,11 +98,11 @@ def make_search_space(config: PlanningConfig, space: StateSpace) -> SearchSpace:
     limits, width = config.limits.axes, len(space)
     if not isinstance(limits, tuple) or len(limits) not in {1, width}:
         without_record = "data, but the model has no record of the motions in its training data"
-        found = without_record if limits == "data" else f"{limits}"
+        problem = without_record if limits == "data" else f"{limits}"
         needed = (
             f"the largest change in a model step for each of the {width} numbers, or one value for all, such as [0.05]"
         )
-        raise InputError(where="planning.limits.axes", found=found, needed=needed)
+        raise InputError(where="planning.limits.axes", found=problem, needed=needed)
     upper = _round_towards_zero(list(limits) * (width // len(limits))).repeat(config.horizon // config.action_repeat, 1)
     return SearchSpace(-upper, upper, upper, config.action_repeat)
 
@@ -136,7 +136,7 @@ def _round_towards_zero(values: list[float]) -> Float[Tensor, " dim"]:
     return torch.where(nearest.double() > exact, torch.nextafter(nearest, torch.zeros_like(nearest)), nearest)
 
 
-_NEAR_M = 1e-8  # rounding of float32 actions; far below the resolution of a robot
+_NEAR_M = 1e-8  # metres; the rounding error of float32 actions, far below the resolution of a robot
 
 
 @dataclass(frozen=True)
@@ -156,9 +156,9 @@ class Workspace:
         if limits.workspace is None:
             return None
         if not space.is_base_pose:
-            found = "a model whose states are not poses in the robot base frame"
+            problem = "a model whose states are not poses in the robot base frame"
             fix = "Limit vector states with planning.limits.axes and in the robot's own controller"
-            raise InputError(where="planning.limits.workspace", found=found, needed="no workspace", fix=fix)
+            raise InputError(where="planning.limits.workspace", found=problem, needed="no workspace", fix=fix)
         return cls(*(np.array(corner, dtype=np.float64) for corner in limits.workspace))
 
     def narrow(self, space: SearchSpace, state: Float[np.ndarray, " 7"]) -> SearchSpace:
@@ -224,7 +224,7 @@ def _shorten_to_l1(
 
 def is_within_limits(motion: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
     """Return whether motions of the flange are within the limits of each axis and of the L1 norm."""
-    longest = np.inf if limits.l1 is None else limits.l1
+    max_l1 = np.inf if limits.l1 is None else limits.l1
     return bool(
-        (abs(motion) <= np.array(limits.xyz_m) + slack_m).all() and (abs(motion).sum(-1) <= longest + slack_m).all()
+        (abs(motion) <= np.array(limits.xyz_m) + slack_m).all() and (abs(motion).sum(-1) <= max_l1 + slack_m).all()
     )

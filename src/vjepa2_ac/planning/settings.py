@@ -40,7 +40,7 @@ def load_planning_config(
         subject: The folder of a run; or a model, as in `model.base`.
         config: A config file, for a model.
         overrides: For example planning.horizon=2.
-        dtype: Of a model's weights, if there is no config.
+        dtype: dtype of the weights of a model, if there is no config.
 
     Raises:
         InputError: A setting is invalid, or is not used for planning.
@@ -48,9 +48,9 @@ def load_planning_config(
     _require_relevant(subject, overrides)
     if is_run(subject):
         if config is not None:
-            found = f"{subject} is a run, and the config of a run is used"
+            problem = f"{subject} is a run, and the config of a run is used"
             fix = "Leave --config out, and override single settings with key=value"
-            raise InputError(where=f"--config {config}", found=found, fix=fix)
+            raise InputError(where=f"--config {config}", found=problem, fix=fix)
         folder = Path(subject)
         settings = resolve_data_limits(read_run_config(folder, [*overrides, _ANY_TYPE]), folder)
     elif config is None:
@@ -106,9 +106,8 @@ def require_base_frame(where: str, *, is_base: bool) -> None:
         InputError: The states are not such poses.
     """
     if not is_base:
-        found = "states that are not poses in the robot's base frame"
         needed = "data.states: pose and data.pose_frame: base"
-        raise InputError(where=where, found=found, needed=needed)
+        raise InputError(where=where, found="states that are not poses in the robot's base frame", needed=needed)
 
 
 def require_calibratable(data: DataConfig) -> None:
@@ -136,13 +135,13 @@ def _require_relevant(subject: str, overrides: Sequence[str]) -> None:
         except KeyError:  # an unknown key; loading the config reports it
             continue
         if sets_movable_path(override) and not is_run(subject):
-            found = f"{subject} is not the folder of a run"
+            problem = f"{subject} is not the folder of a run"
             raise InputError(
-                where=f"override {override}", found=found, needed="the folder of a run, to change this path"
+                where=f"override {override}", found=problem, needed="the folder of a run, to change this path"
             )
         if not is_relevant:
-            found = "a setting that planning does not use"
-            raise InputError(where=f"override {override}", found=found, needed=f"one of {', '.join(USED_KEYS)}")
+            problem = "a setting that planning does not use"
+            raise InputError(where=f"override {override}", found=problem, needed=f"one of {', '.join(USED_KEYS)}")
 
 
 def require_limits(config: Config) -> None:

@@ -21,7 +21,7 @@ from vjepa2_ac.config.section import Positive, PositiveInt, Section, Share, Zero
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.search_space import SearchSpace
 
-_MIN_PRIOR_STD = 0.1  # lower bound on the std from a prior, relative to the usual std: a prior is overconfident
+_MIN_PRIOR_STD = 0.1  # lower bound on the std from a prior, relative to the planner's; a prior is overconfident
 Momentum = float | Tensor  # share of the old mean or standard deviation in the new one
 Elites = Annotated[int, Field(ge=2)]
 
@@ -250,13 +250,13 @@ class IcemSolver(Solver):
         return space.clip(torch.cat(evaluated))
 
     def update(self, evaluated: EvaluatedPlans) -> None:
-        """Fit the distribution to the elites, and keep some of them."""
+        """Fit the distribution to the elites, and reuse some of them in the next iteration."""
         best, keep = evaluated.select_best(self.elites).decisions, self._options.momentum
         self._fit_to_elites(best, keep, keep)
         if len(best):
             self._reused = self._select_reused(best)
 
-    def _select_reused(self, elites: Float[Tensor, "elites decisions dim"]) -> Float[Tensor, "kept decisions dim"]:
+    def _select_reused(self, elites: Float[Tensor, "elites decisions dim"]) -> Float[Tensor, "reused decisions dim"]:
         return elites[: round(self._options.kept * self.elites)]
 
 
@@ -271,11 +271,11 @@ def draw_coloured_noise(samples: int, decisions: int, dim: int, exponent: float,
     frequency = torch.fft.rfftfreq(decisions).clamp(min=1 / decisions)
     scale = frequency ** (-exponent / 2)
     parts = torch.randn(2, samples, dim, len(frequency), generator=generator)
-    single = torch.zeros(len(frequency), dtype=torch.bool)  # real coefficients (constant and Nyquist), counted once
-    single[0] = True
-    single[-1] = single[-1] or decisions % 2 == 0
-    wave = torch.complex(parts[0], parts[1].masked_fill(single, 0.0)) * torch.where(single, 1.0, 0.5**0.5)
-    power: Tensor = (scale**2 * torch.where(single, 1.0, 2.0)).sum() / decisions
+    is_real = torch.zeros(len(frequency), dtype=torch.bool)  # constant and Nyquist, which have no conjugate
+    is_real[0] = True
+    is_real[-1] = is_real[-1] or decisions % 2 == 0
+    wave = torch.complex(parts[0], parts[1].masked_fill(is_real, 0.0)) * torch.where(is_real, 1.0, 0.5**0.5)
+    power: Tensor = (scale**2 * torch.where(is_real, 1.0, 2.0)).sum() / decisions
     noise: Tensor = torch.fft.irfft(wave * scale, n=decisions, norm="ortho").transpose(1, 2)
     return noise / power.sqrt()
 
@@ -323,17 +323,17 @@ class PriorSolver(Solver):
     """
 
     def num_samples(self, iteration: int) -> int:
-        """Return one for the only iteration."""
+        """Return 1 for the first iteration and 0, which ends the search, for the second."""
         return int(iteration == 0)
 
     def begin(self, start: OptionalStart) -> None:
         """Refuse a search without a prior."""
         if start is None:
-            found, needed = (
-                "prior, but no action prior is loaded",
-                "planning.prior, or a planner that searches, such as cem",
+            raise InputError(
+                where="planning.planner",
+                found="prior, but no action prior is loaded",
+                needed="planning.prior, or a planner that searches, such as cem",
             )
-            raise InputError(where="planning.planner", found=found, needed=needed)
 
     def sample(self) -> Samples:
         """Return the prior's mean."""
@@ -374,8 +374,8 @@ class GradientSolver(Solver):
         origin = torch.zeros_like(space.lower)
         if start is not None:
             origin = start.elites[0] if len(start.elites) else start.mean
-        half = (space.upper - space.lower) / 2
-        self._unit = torch.where(half > 0, half, 1.0)
+        half_range = (space.upper - space.lower) / 2
+        self._unit = torch.where(half_range > 0, half_range, 1.0)
         self._scaled = space.clip(origin + self.std * noise) / self._unit
         self._adam = torch.optim.Adam([self._scaled], lr=options.learning_rate)
         self._schedule = torch.optim.lr_scheduler.LambdaLR(

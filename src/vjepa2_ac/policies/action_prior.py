@@ -207,8 +207,8 @@ def load_prior_for_planning(path: str, known: Fingerprints, cameras: Cameras) ->
     card, prior = load_prior(path, where="planning.prior")
     for name, trained, model in (("encoder", card.encoder, known.encoder), ("data.crop", card.crop, cameras.crop)):
         if trained != model:
-            found, needed = f"a prior for {name} {trained}; this model has {model}", "a prior trained for this model"
-            raise InputError(where=f"planning.prior: {path}", found=found, needed=needed, fix=_FIX)
+            problem, needed = f"a prior for {name} {trained}; this model has {model}", "a prior trained for this model"
+            raise InputError(where=f"planning.prior: {path}", found=problem, needed=needed, fix=_FIX)
     return prior.to(cameras.model.device).make_start
 
 
@@ -262,9 +262,9 @@ def train_prior(
     reporter.task(LOADING)
     model, spaces = load_base(config.model, seed=config.seed).to(device), frames.spaces  # only the encoder is used
     if spaces.action.follows == "unknown":
-        found = "actions whose effect on the state is unknown, so that a planner cannot use them"
+        problem = "actions whose effect on the state is unknown, so that a planner cannot use them"
         needed = "data.actions: difference, or data.join_actions: sum or last"
-        raise InputError(where="data.actions: recorded", found=found, needed=needed)
+        raise InputError(where="data.actions: recorded", found=problem, needed=needed)
     dataset = use_finished_cache(config, frames, model)
     if options.ahead is not None:
         dataset = dataset.with_frames(options.ahead + 1)
@@ -312,9 +312,9 @@ def _train(
             loss.backward()  # type: ignore[no-untyped-call]  # torch
             norm = torch.nn.utils.clip_grad_norm_(prior.parameters(), _CLIP)
             if not math.isfinite(float(norm)):
-                found = f"the loss of step {step} is not finite"
+                problem = f"the loss of step {step} is not finite"
                 raise InputError(
-                    where="vjepa2-ac prior", found=found, fix="Check the states with `vjepa2-ac data check`"
+                    where="vjepa2-ac prior", found=problem, fix="Check the states with `vjepa2-ac data check`"
                 )
             optimizer.step()
             progress(step, steps)

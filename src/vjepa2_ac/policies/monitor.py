@@ -104,9 +104,9 @@ def compute_conformal_threshold(scores: Float[Tensor, " episodes"], false_alarms
     rank = -int(-(count + 1) * (1.0 - false_alarms) // 1)
     if not 1 <= rank <= count:
         needed = f"at least {int(-(-1 // false_alarms)) - 1} episodes" if false_alarms > 0 else "a share above 0"
-        found = f"{counted(count, 'held-out episode')} for a false alarm rate of {false_alarms:.1%}"
+        problem = f"{counted(count, 'held-out episode')} for a false alarm rate of {false_alarms:.1%}"
         fix = "Record more episodes, or raise data.test_share or --false-alarms"
-        raise InputError(where="--false-alarms", found=found, needed=needed, fix=fix)
+        raise InputError(where="--false-alarms", found=problem, needed=needed, fix=fix)
     return float(torch.sort(scores).values[rank - 1])
 
 

@@ -224,14 +224,16 @@ def score_policies(
         by_policy = np.split(proposed, np.cumsum([len(policy_chunks) for policy_chunks in chunks])[:-1])
         means = [float(chunk_energies.mean()) for chunk_energies in by_policy]
         lowest = [float(chunk_energies.min()) for chunk_energies in by_policy]
-        below_true = float((alternative < true).mean())
-        energies.append(np.array([scores.zero_action_energy, true[0], below_true, *means, *lowest]))
+        share_below_true = float((alternative < true).mean())
+        energies.append(np.array([scores.zero_action_energy, true[0], share_below_true, *means, *lowest]))
         progress(number + 1, len(points))
-    zero_action, demonstrated, below, *of_policies = np.stack(energies).T
+    zero_action, demonstrated, shares_below_true, *policy_energies = np.stack(energies).T
     return PolicyScores(
-        policies=_rank_policies(policies, of_policies[: len(policies)], of_policies[len(policies) :], zero_action, ids),
+        policies=_rank_policies(
+            policies, policy_energies[: len(policies)], policy_energies[len(policies) :], zero_action, ids
+        ),
         demonstrated=estimate_ratio(demonstrated, zero_action, ids),
-        others_below_true=estimate_mean(below, ids),
+        others_below_true=estimate_mean(shares_below_true, ids),
         places=len(ids),
         episodes=len(set(ids)),
         left_out=len(common_points) - len(points),

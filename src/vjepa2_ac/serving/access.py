@@ -43,10 +43,10 @@ class Access:
 
     def __post_init__(self) -> None:
         if not is_loopback(self.host) and self.key is None and not self.is_insecure:
-            found = "other machines can reach this address, and no key is set, so any of them could move the robot"
+            problem = "other machines can reach this address, and no key is set, so any of them could move the robot"
             needed = "--key-file FILE with the key that clients send, or --host 127.0.0.1"
             fix = "Use --insecure only in a network in which every machine may move the robot"
-            raise InputError(where=f"--host {self.host}", found=found, needed=needed, fix=fix)
+            raise InputError(where=f"--host {self.host}", found=problem, needed=needed, fix=fix)
 
     def find_rejection(self, host: str | None, authorization: str | None) -> tuple[int, str] | None:
         """Return the HTTP status and the reason for which a request is rejected; None if it is accepted.
@@ -88,16 +88,16 @@ def read_key(path: Path) -> str:
         text = path.read_text(encoding="ascii")
         mode = path.stat().st_mode
     except (OSError, UnicodeDecodeError) as error:
-        found = error.strerror if isinstance(error, OSError) else "characters that are not ASCII"
+        problem = error.strerror if isinstance(error, OSError) else "characters that are not ASCII"
         raise InputError(
-            where=f"--key-file {path}", found=str(found), needed="a text file with a key in the first line"
+            where=f"--key-file {path}", found=str(problem), needed="a text file with a key in the first line"
         ) from None
     key = text.partition("\n")[0].strip()
     if len(key) < MIN_KEY_CHARACTERS or not key.isprintable() or " " in key:
-        found = f"the first line is no valid key ({len(key)} characters)"
+        problem = f"the first line is no valid key ({len(key)} characters)"
         fix = f"Create a key: python -c 'import secrets; print(secrets.token_urlsafe())' > {shlex.quote(str(path))}"
         needed = f"a key of at least {MIN_KEY_CHARACTERS} printable ASCII characters without spaces"
-        raise InputError(where=f"--key-file {path}", found=found, needed=needed, fix=fix)
+        raise InputError(where=f"--key-file {path}", found=problem, needed=needed, fix=fix)
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         logger.warning(
             "other users of this machine can read the key in %s. Restrict the access: chmod 600 %s",

@@ -47,8 +47,8 @@ class PlanningClient(ExitStack):
         except Exception as error:
             self.close()
             body = getattr(getattr(error, "response", None), "body", None)  # the server's reason for a rejection
-            found = f"{_reason(error)}: {body.decode(errors='replace').strip()}" if body else _reason(error)
-            raise UnreachableError(where=url, found=found, needed="a running server (`vjepa2-ac serve`)") from None
+            problem = f"{_reason(error)}: {body.decode(errors='replace').strip()}" if body else _reason(error)
+            raise UnreachableError(where=url, found=problem, needed="a running server (`vjepa2-ac serve`)") from None
         deadline_s = self.metadata.get("deadline_s")
         self._timeout_s = timeout_s or max(_REPLY_TIMEOUT_S, 2 * deadline_s if isinstance(deadline_s, float) else 0.0)
 
@@ -65,8 +65,8 @@ class PlanningClient(ExitStack):
             answer = self._connection.recv(timeout=self._timeout_s)
         except TimeoutError:
             self.close()
-            found, fix = f"no reply within {self._timeout_s:g} s", "Check the server's log and connect again"
-            raise UnreachableError(where=self.url, found=found, fix=fix) from None
+            problem, fix = f"no reply within {self._timeout_s:g} s", "Check the server's log and connect again"
+            raise UnreachableError(where=self.url, found=problem, fix=fix) from None
         except Exception as error:
             raise UnreachableError(where=self.url, found=f"the connection was lost ({_reason(error)})") from None
         if isinstance(answer, str):

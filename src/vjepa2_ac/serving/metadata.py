@@ -89,8 +89,8 @@ def warm_up(controller: Controller) -> float:
     controller.reset(goal)
     controller.act(frame, state)
     if controller.decision is None or controller.decision.why == "no finite energy":
-        found = "the model returned no finite energy for any action"
-        raise InputError(where="serve", found=found, fix="Choose another checkpoint: --checkpoint")
+        problem = "the model returned no finite energy for any action"
+        raise InputError(where="serve", found=problem, fix="Choose another checkpoint: --checkpoint")
     return time.perf_counter() - start_time
 
 
@@ -109,8 +109,8 @@ def read_named_goals(folder: Path) -> NamedGoals:
         InputError: There is no goal, two goals have the same name, or a file cannot be read.
     """
     if not folder.is_dir():
-        found = "a file" if folder.exists() else "no such folder"
-        raise InputError(where=f"--goals {folder}", found=found, needed="a folder with goal images")
+        problem = "a file" if folder.exists() else "no such folder"
+        raise InputError(where=f"--goals {folder}", found=problem, needed="a folder with goal images")
     if (folder / GOALS_FILE).is_file():
         return {folder.resolve().name: read_goal_folder(folder)}
     goals: dict[str, tuple[SubGoal, ...]] = {}

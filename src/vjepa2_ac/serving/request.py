@@ -131,9 +131,8 @@ def _parse_state(message: Mapping[str, Any]) -> np.ndarray:
         )
     pose, gripper = _parse_numbers(message[_POSE], _POSE), _parse_numbers(message[_GRIPPER], _GRIPPER)
     if pose.shape != (6,) or gripper.shape != (1,):
-        found = f"{pose.size} and {gripper.size} numbers"
         needed = "6 numbers (x, y, z in metres; roll, pitch, yaw in radians, extrinsic xyz) and 1 (0 open, 1 closed)"
-        raise InputError(where=f"{_POSE}, {_GRIPPER}", found=found, needed=needed)
+        raise InputError(where=f"{_POSE}, {_GRIPPER}", found=f"{pose.size} and {gripper.size} numbers", needed=needed)
     return np.concatenate([pose, gripper])
 
 
@@ -165,9 +164,9 @@ def _parse_goal(message: Mapping[str, Any]) -> GoalRequest | None:
             _parse_mask(message.get("goal/mask")),
         )
     if len(goal_keys) > 1:
-        found = ", ".join(goal_keys)
+        problem = ", ".join(goal_keys)
         raise InputError(
-            where="goal", found=found, needed="only goal/name, because a named goal has its own rules and mask"
+            where="goal", found=problem, needed="only goal/name, because a named goal has its own rules and mask"
         )
     key = "goal/name" if main_keys else "prompt"
     name = message.get(key)
@@ -217,8 +216,8 @@ def _parse_mask(value: Any) -> np.ndarray | None:
 
 
 def _make_missing_key_error(message: Mapping[str, Any], needed: str) -> InputError:
-    found = f"the keys {', '.join(sorted(map(repr, message)))}" if message else "an empty map"
-    return InputError(where="request", found=found, needed=needed)
+    problem = f"the keys {', '.join(sorted(map(repr, message)))}" if message else "an empty map"
+    return InputError(where="request", found=problem, needed=needed)
 
 
 def _make_error(where: str, value: Any, needed: str) -> InputError:

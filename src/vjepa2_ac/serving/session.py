@@ -106,8 +106,10 @@ class Session:
         self._notes: list[str] = []  # notes for the client in this episode
         self._last_ms: float | None = None
         if self.options.actions == "pose" and not controller.spaces.state.is_pose:
-            found = "the states of the model are not poses"
-            raise InputError(where="--actions pose", found=found, needed="--actions delta, or a model with pose states")
+            problem = "the states of the model are not poses"
+            raise InputError(
+                where="--actions pose", found=problem, needed="--actions delta, or a model with pose states"
+            )
 
     def reset(self) -> None:
         """Reset the state of the session for another robot."""
@@ -171,11 +173,8 @@ class Session:
         if self._goal is None:
             needed = f"goal/image, goal/images or goal/name{self._format_known_goals()}"
             raise InputError(where="request", found="no goal was set in this episode", needed=needed)
-        changes, planning_start, observation = (
-            self._convert_chunks(request),
-            self._clock(),
-            (request.frame, request.state),
-        )
+        changes, planning_start = self._convert_chunks(request), self._clock()
+        observation = request.frame, request.state
         if request.is_score and changes is not None:  # the robot does not move, and no decision is counted
             scores = self.controller.score(*observation, changes, cancelled=cancelled)
             return {**scores.as_dict(is_blind=self.options.is_blind), "goal": scores.goal}

@@ -71,12 +71,12 @@ class RangedFile(io.RawIOBase):
     def readinto(self, buffer: bytearray | memoryview, /) -> int:  # type: ignore[override] # any writable buffer
         """Fill a buffer with the next bytes; return the number of bytes read."""
         view = memoryview(buffer).cast("B")
-        data = self._range(self._position, min(self._position + len(view), self._size))
+        data = self._read_range(self._position, min(self._position + len(view), self._size))
         view[: len(data)] = data
         self._position += len(data)
         return len(data)
 
-    def _range(self, start: int, end: int) -> bytes:
+    def _read_range(self, start: int, end: int) -> bytes:
         if start >= end:
             return b""
         first, last = start // BLOCK_BYTES, (end - 1) // BLOCK_BYTES
@@ -253,12 +253,12 @@ class BlockCachedFile(RangedFile):
     """
 
     def __init__(self, path: str, *, version: str, size: int, cache: DiskCache) -> None:
-        super().__init__(self._fetched, size)
+        super().__init__(self._fetch_blocks, size)
         self._path, self._cache = path, cache
         self._bytes, self._key = size, f"{path} {version} {size}"
         self.failure: Exception | None = None
 
-    def _fetched(self, start: int, length: int) -> bytes:
+    def _fetch_blocks(self, start: int, length: int) -> bytes:
         """Return the bytes of whole blocks from the disk cache or the URL."""
         blocks = [(at, min(BLOCK_BYTES, self._bytes - at)) for at in range(start, start + length, BLOCK_BYTES)]
         try:
@@ -283,12 +283,12 @@ def cached_ranges(url: str, ranges: Sequence[tuple[int, int]], *, key: str, cach
         OSError: There is no such file, or it ends within a piece.
         UnreachableError: The file cannot be reached.
     """
-    pieces = {span: cache.read(f"{key} {span}") or b"" for span in ranges}
-    missing = sorted(span for span, data in pieces.items() if len(data) != span[1])
-    for span, data in zip(missing, remote.read_adjacent_ranges(url, missing), strict=True):
-        pieces[span] = data
-        cache.write(f"{key} {span}", data)
-    return [pieces[span] for span in ranges]
+    pieces = {byte_range: cache.read(f"{key} {byte_range}") or b"" for byte_range in ranges}
+    missing = sorted(byte_range for byte_range, data in pieces.items() if len(data) != byte_range[1])
+    for byte_range, data in zip(missing, remote.read_adjacent_ranges(url, missing), strict=True):
+        pieces[byte_range] = data
+        cache.write(f"{key} {byte_range}", data)
+    return [pieces[byte_range] for byte_range in ranges]
 
 
 def open_remote(url: str) -> RangedFile:

@@ -175,9 +175,9 @@ def read_error(where: str, error: OSError, *, needed: str = "", fix: str = "") -
     if isinstance(error, FileNotFoundError | NotADirectoryError):  # for a URL the error has no errno
         absent = os.strerror(errno.ENOENT)
         return MissingFileError(where=where, found=f"cannot be read: {absent}", needed=needed, fix=fix)
-    found = f"cannot be read: {error.strerror or error}"
+    problem = f"cannot be read: {error.strerror or error}"
     if isinstance(error, ShortReadError | IsADirectoryError) or error.errno in _MISSING_ERRNOS:
-        return InputError(where=where, found=found, needed=needed, fix=fix)
+        return InputError(where=where, found=problem, needed=needed, fix=fix)
     refusal, fix = describe_refusal(error)
     kind = RefusedError if isinstance(error, PermissionError) else UnreachableError
     return kind(where=where, found=f"cannot be read: {refusal}", needed=needed, fix=fix)
@@ -368,8 +368,8 @@ def translate_write_errors(path: str | Path, errors: frozenset[int] = _WRITE_ERR
     except OSError as error:
         if error.errno not in errors:
             raise
-        full = error.errno in _DISK_FULL_ERRNOS
-        fix = "Free some space, or choose a path on another disk" if full else "Choose a path that can be written"
+        is_full = error.errno in _DISK_FULL_ERRNOS
+        fix = "Free some space, or choose a path on another disk" if is_full else "Choose a path that can be written"
         raise InputError(where=str(path), found=f"cannot be written: {error.strerror}", fix=fix) from None
 
 
@@ -387,8 +387,8 @@ def require_new_folder(folder: Path) -> None:
     with translate_write_errors(folder):
         is_free = not folder.exists() or (folder.is_dir() and is_empty(folder))
     if not is_free:
-        found = "the folder exists and is not empty" if folder.is_dir() else "a file with this name exists"
-        raise InputError(where=str(folder), found=found, fix="Delete it, or choose another path")
+        problem = "the folder exists and is not empty" if folder.is_dir() else "a file with this name exists"
+        raise InputError(where=str(folder), found=problem, fix="Delete it, or choose another path")
 
 
 def check_local_writable(path: Path) -> None:

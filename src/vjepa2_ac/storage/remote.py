@@ -232,9 +232,9 @@ def _version_of(entry: Mapping[str, Any]) -> str:
 
 def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
     """Read a range with one request; accept a short response only at the end of the file."""
-    bare: Any = {} if _filesystem(url).async_impl else {"cache_type": "none"}  # the default prefetches megabytes
+    no_prefetch: Any = {} if _filesystem(url).async_impl else {"cache_type": "none"}  # the default prefetches megabytes
     try:
-        data: bytes = _call_method(url, "cat_file", timeout_s, start=start, end=start + length, **bare)
+        data: bytes = _call_method(url, "cat_file", timeout_s, start=start, end=start + length, **no_prefetch)
     except Exception as error:
         if retries.http_status(error) != 416:
             raise
@@ -325,21 +325,23 @@ def _filesystem(url: str, *, writing: bool = False) -> Any:
     """
     protocol = _protocol(url)
     with _opening:
-        kind = _kind(url, protocol)
+        kind = _import_filesystem(url, protocol)
         options: dict[str, Any] = kind._get_kwargs_from_urls(url)
         if protocol == "gs":
             options["access"] = "read_write" if writing else "read_only"
         key = (os.getpid(), protocol, repr(sorted(options.items())), os.environ.get(_EMULATOR))
         if key not in _filesystems:
             try:
-                opened = _google(kind, options) if protocol == "gs" else kind(**options, skip_instance_cache=True)
+                filesystem = (
+                    _open_google(kind, options) if protocol == "gs" else kind(**options, skip_instance_cache=True)
+                )
             except TypeError as error:  # this file system needs more arguments than a URL holds
                 raise InputError(
                     where=url,
                     found=f"{protocol}:// needs options that a URL cannot hold ({error})",
                     needed=_SUPPORTED_LOCATIONS,
                 ) from None
-            _filesystems[key] = opened
+            _filesystems[key] = filesystem
         return _filesystems[key]
 
 
@@ -348,7 +350,7 @@ def _protocol(url: str) -> str:
     return "gs" if protocol == "gcs" else protocol
 
 
-def _kind(url: str, protocol: str) -> Any:
+def _import_filesystem(url: str, protocol: str) -> Any:
     # Before gcsfs is imported: its support for zonal buckets, on by default, makes the first call to each bucket wait
     # for a minute where the Storage Control API does not answer.
     os.environ.setdefault("GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT", "false")
@@ -369,7 +371,7 @@ def _kind(url: str, protocol: str) -> Any:
         raise InputError(where=url, found=f"unknown protocol {protocol}://", needed=_SUPPORTED_LOCATIONS) from None
 
 
-def _google(kind: Any, options: dict[str, Any]) -> Any:
+def _open_google(kind: Any, options: dict[str, Any]) -> Any:
     """Open gcsfs without its own retries, which would add six attempts (up to 30 s) to each of `call_with_retries`."""
     once = getattr(kind._request, "__wrapped__", kind._request)
     open_as = partial(type(kind.__name__, (kind,), {"_request": once}), use_listings_cache=False, **options)

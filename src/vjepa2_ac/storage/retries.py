@@ -77,7 +77,7 @@ def call_with_retries(
         UnreachableError: The failure did not pass in time; a RefusedError if permission is missing or the failure is
             permanent.
     """
-    begin, failures, before = time.monotonic(), 0, progress()
+    started, failures, last_progress = time.monotonic(), 0, progress()
     while True:
         try:
             return action(policy.timeout_s)
@@ -88,17 +88,17 @@ def call_with_retries(
                 raise  # a programming error such as a TypeError
             if not _is_temporary(error):
                 is_denied = http_status(error) in _NO_ACCESS or _is_login_error(error)
-                found = f"{'no permission' if is_denied else f'cannot be {operation}'} ({_summary(error)})"
+                problem = f"{'no permission' if is_denied else f'cannot be {operation}'} ({_summary(error)})"
                 fix = access if is_denied else "Check the URL"
-                raise RefusedError(where=where, found=found, fix=fix) from error
-            if progress() > before:
-                begin, failures = time.monotonic(), 0
-            before, failures = progress(), failures + 1
-            wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
+                raise RefusedError(where=where, found=problem, fix=fix) from error
+            if progress() > last_progress:
+                started, failures = time.monotonic(), 0
+            last_progress, failures = progress(), failures + 1
+            wait_s, seconds = policy.wait_s(failures), time.monotonic() - started
             if failures >= policy.attempts or seconds + wait_s > policy.total_s:
-                found = f"{counted(failures, 'attempt')} in {seconds:.0f} s failed. Last error: {_summary(error)}"
+                problem = f"{counted(failures, 'attempt')} in {seconds:.0f} s failed. Last error: {_summary(error)}"
                 fix = "Check the network and run the command again; training resumes from the newest checkpoint"
-                raise UnreachableError(where=where, found=found, fix=fix) from error
+                raise UnreachableError(where=where, found=problem, fix=fix) from error
             _log_failure(failures, "%s: %s. Next attempt in %.1f s", where, _summary(error), wait_s)
         time.sleep(wait_s)
 
@@ -134,9 +134,8 @@ def http_status(error: BaseException) -> int | None:
             status = getattr(holder, name, None)
             if isinstance(status, int | str) and str(status).isdigit():
                 return int(status)
-    return (
-        403 if isinstance(error, PermissionError) or str(error).startswith("Forbidden") else None
-    )  # the text of gcsfs
+    is_forbidden = isinstance(error, PermissionError) or str(error).startswith("Forbidden")  # the text of gcsfs
+    return 403 if is_forbidden else None
 
 
 def _is_temporary(error: Exception) -> bool:

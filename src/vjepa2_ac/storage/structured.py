@@ -216,9 +216,9 @@ _NUMBERS = {  # PyYAML's patterns read 017 and 12:30 as numbers, and 1e-4 as a s
         r"|\.(?:inf|Inf|INF))$|\.(?:nan|NaN|NAN)$"
     ),
 }
-_OTHERS = {f"tag:yaml.org,2002:{name}" for name in (*_NUMBERS, "timestamp", "value")}
+_OTHER_TAGS = {f"tag:yaml.org,2002:{name}" for name in (*_NUMBERS, "timestamp", "value")}
 _Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if tag not in _OTHERS]
+    first: [(tag, pattern) for tag, pattern in resolvers if tag not in _OTHER_TAGS]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
 for _name, _pattern in _NUMBERS.items():

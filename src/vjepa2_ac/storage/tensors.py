@@ -55,8 +55,8 @@ def read_tensors(
         InputError: The file is missing, truncated or of another format, or holds other tensors, NaN or infinity.
     """
     with open_safetensors(path, needed=needed) as file:
-        found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
-        check_tensors(found, {name: value.shape for name, value in like.items()}, where=str(path), fix=fix)
+        shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
+        check_tensors(shapes, {name: value.shape for name, value in like.items()}, where=str(path), fix=fix)
         mapped = {name: file.get_tensor(name) for name in like}
         require_floats(mapped, where=str(path), fix=fix)
         # Copied, because the memory-mapped file may be replaced while the tensors are in use.
@@ -83,27 +83,27 @@ def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
         except (SafetensorError, OSError, TypeError) as error:  # TypeError: a dtype that torch does not have
             if storage.is_os_read_error(error):
                 raise
-            found = f"not a complete safetensors file ({error})"
-            raise InputError(where=str(path), found=found, needed=needed, fix=fix) from None
+            problem = f"not a complete safetensors file ({error})"
+            raise InputError(where=str(path), found=problem, needed=needed, fix=fix) from None
 
 
 def check_tensors(
-    found: Mapping[str, tuple[int, ...]], needed: Mapping[str, tuple[int, ...]], *, where: str, fix: str
+    shapes: Mapping[str, tuple[int, ...]], expected: Mapping[str, tuple[int, ...]], *, where: str, fix: str
 ) -> None:
     """Refuse tensors that are missing, unknown or of another shape.
 
     Raises:
         InputError: Names the first four such tensors.
     """
-    problems = [f"missing: {name}" for name in needed.keys() - found.keys()]
-    problems += [f"unexpected: {name}" for name in found.keys() - needed.keys()]
-    for name in needed.keys() & found.keys():
-        if found[name] != needed[name]:
-            problems.append(f"{name} has shape {list(found[name])}, not {list(needed[name])}")
+    problems = [f"missing: {name}" for name in expected.keys() - shapes.keys()]
+    problems += [f"unexpected: {name}" for name in shapes.keys() - expected.keys()]
+    for name in expected.keys() & shapes.keys():
+        if shapes[name] != expected[name]:
+            problems.append(f"{name} has shape {list(shapes[name])}, not {list(expected[name])}")
     if problems:
         shown = "; ".join(sorted(problems)[:4]) + (f"; and {len(problems) - 4} more" if len(problems) > 4 else "")
-        found_text = f"{len(problems)} tensors do not match ({shown})"
-        raise InputError(where=where, found=found_text, needed="exactly the tensors of the model", fix=fix)
+        problem = f"{len(problems)} tensors do not match ({shown})"
+        raise InputError(where=where, found=problem, needed="exactly the tensors of the model", fix=fix)
 
 
 def require_floats(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> None:

@@ -35,7 +35,7 @@ def upload(source: Path, target: str) -> None:
         UnreachableError: The target cannot be written; a RefusedError if that is permanent.
     """
     if not is_url(target):
-        with source.open("rb") as file, _write_errors_as_user_errors(target), atomic_writer(target) as copy:
+        with source.open("rb") as file, _translate_target_errors(target), atomic_writer(target) as copy:
             shutil.copyfileobj(file, copy)
         return
     try:
@@ -43,7 +43,7 @@ def upload(source: Path, target: str) -> None:
     except FileNotFoundError:
         if not source.is_file():
             raise
-        raise _no_bucket(target) from None
+        raise _missing_bucket_error(target) from None
 
 
 def write(path: str, data: bytes | str) -> None:
@@ -91,7 +91,7 @@ def remove(path: str) -> None:
         with suppress(FileNotFoundError):
             remote.remove(path)
         return
-    with _write_errors_as_user_errors(path):
+    with _translate_target_errors(path):
         Path(path).unlink(missing_ok=True)
 
 
@@ -105,7 +105,7 @@ def remove_folder(folder: str, *, first: str) -> None:
     for name in file_sizes(folder):
         remove(join(folder, name))
     if not is_url(folder) and Path(folder).exists():
-        with _write_errors_as_user_errors(folder):
+        with _translate_target_errors(folder):
             shutil.rmtree(folder)
 
 
@@ -116,7 +116,7 @@ def file_sizes(folder: str) -> dict[str, int]:
         UnreachableError: The folder cannot be listed; a RefusedError if that is permanent.
     """
     if not is_url(folder):
-        with _write_errors_as_user_errors(folder):
+        with _translate_target_errors(folder):
             sizes = dict[str, int]()
             for path in Path(folder).rglob("*"):
                 with suppress(FileNotFoundError):  # a temporary file that was renamed meanwhile
@@ -136,7 +136,7 @@ def list_files_below(url: str) -> dict[str, FileInfo]:
         return remote.list_files_below(url)
     except FileNotFoundError:
         if url.startswith(("gs://", "gcs://")):  # has no folders, so only buckets can be missing
-            raise _no_bucket(url) from None
+            raise _missing_bucket_error(url) from None
         return {}
 
 
@@ -147,7 +147,7 @@ def check_writable(folder: str) -> None:
         UnreachableError: The folder cannot be written now; a RefusedError if that is permanent.
     """
     if not is_url(folder):
-        with _write_errors_as_user_errors(folder):
+        with _translate_target_errors(folder):
             check_local_writable(Path(folder))
         return
     trial = join(folder, f".write-check-{secrets.token_hex(8)}")
@@ -156,16 +156,16 @@ def check_writable(folder: str) -> None:
 
 
 @contextmanager
-def _write_errors_as_user_errors(path: str) -> Iterator[None]:
+def _translate_target_errors(path: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
         kind = UnreachableError if error.errno in _TEMPORARY_ERRORS else RefusedError
-        found = f"cannot be written: {error.strerror or error}"
-        raise kind(where=path, found=found, fix="Check the permissions and the disk") from error
+        problem = f"cannot be written: {error.strerror or error}"
+        raise kind(where=path, found=problem, fix="Check the permissions and the disk") from error
 
 
-def _no_bucket(url: str) -> RefusedError:
+def _missing_bucket_error(url: str) -> RefusedError:
     bucket = url.partition("://")[2].split("/", 1)[0]
     return RefusedError(where=url, found=f"bucket {bucket} does not exist", fix="Create the bucket, or check its name")
 
@@ -192,9 +192,9 @@ def download_from_hub(name: str, files: Sequence[str], *, where: str) -> Path:
         fix = (
             "Check the name (hf://owner/name@revision). For a gated model, request access on its page. For a model that"
         )
-        found = "the model or revision does not exist, or you have no access"
+        problem = "the model or revision does not exist, or you have no access"
         fix = f"{fix} is not public, run `hf auth login` or set HF_TOKEN"
-        raise RefusedError(where=where, found=found, fix=fix) from None
+        raise RefusedError(where=where, found=problem, fix=fix) from None
     except errors.LocalEntryNotFoundError:
         fix = "Check the network, or use a local folder"
         raise UnreachableError(where=where, found="the Hub cannot be reached", fix=fix) from None

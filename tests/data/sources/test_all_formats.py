@@ -103,9 +103,9 @@ def test_idle_filter_selects_the_same_steps_in_all_formats(forms: Path, form: st
     rules = [MOTION] if form == "npz" else [MOTION, COMMANDS]  # .npz has no commanded velocities
     for rule in rules:
         expected, found = open_format(forms, "rlds", idle=rule), open_format(forms, form, idle=rule)
-        assert 0 < expected.kept_steps.num_steps < sum(LENGTHS)
+        assert 0 < expected.selected_steps.num_steps < sum(LENGTHS)
         by_rank = [
-            [dataset.kept_steps.ranges_of(episode) for episode in np.argsort(dataset.table.id_rank).tolist()]
+            [dataset.selected_steps.ranges_of(episode) for episode in np.argsort(dataset.table.id_rank).tolist()]
             for dataset in (expected, found)
         ]
         assert by_rank[0] == by_rank[1]

@@ -168,7 +168,10 @@ BROKEN = {
     "no trajectory": (lambda folder: (folder / "trajectory.h5").unlink(), "trajectory.h5"),
     "no metadata": (lambda folder: next(folder.glob("*.json")).unlink(), "metadata"),
     "no video": (lambda folder: (folder / MP4).unlink(), f"{LEFT}.mp4: no such file"),
-    "no key": (put(GRIPPER, None), "gripper_position: no such array"),
+    "no key": (
+        put(GRIPPER, None),
+        "gripper_position: no such array; group observation/robot_state contains cartesian_position",
+    ),
     "text for numbers": (put(POSE, np.full((STEPS, 6), b"x")), "kind"),
     "shorter gripper": (put(GRIPPER, STATES[:-1, 6]), "gripper: values for 23 of 24 steps"),
     "no steps": (put(POSE, np.zeros((0, 6))), "no steps"),

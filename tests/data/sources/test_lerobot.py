@@ -348,7 +348,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "out of reach": (spoiled(with_value(5, 50.0)), "Expected a position within 5 m"),
     "five numbers": (spoiled(lambda rows: np.float32(rows)[:, :5]), r"5 numbers per row\. Expected 6, according to"),
     "uneven": (spoiled(lambda rows: pa.array([rows[0][:5], *rows[1:]], LIST)), "5 numbers in one row and 6 in another"),
-    "gaps": (spoiled(lambda rows: pa.array([None, *rows[1:]], LIST)), "1 rows without a value"),
+    "gaps": (spoiled(lambda rows: pa.array([None, *rows[1:]], LIST)), "1 row without a value"),
     "words": (spoiled(lambda rows: pa.array(["a"] * len(rows))), "values of type string"),
     "lost rows": (select_rows(*range(10)), r"10 rows\. Expected 12"),
     "mixed rows": (select_rows(1, 0, *range(2, 12)), "frame_index does not count from 0 to 11"),

@@ -33,7 +33,7 @@ VIDEOS = "recordings/MP4"
 
 _OUTCOMES = ("success", "failure")
 _FIX = "Copy the episode again"
-_MAX_STEPS = 1_000_000  # a damaged header may claim any number
+_MAX_STEPS = 1_000_000  # limit, because a damaged header may state any number
 _REQUIRED = {
     "pose": ("observation/robot_state/cartesian_position", 6),
     "gripper": ("observation/robot_state/gripper_position", 1),
@@ -131,8 +131,8 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         has_trajectory = any(file.name == TRAJECTORY for file in listed.files)
         if not has_trajectory or listed.metadata is None:
             file = "metadata_*.json" if has_trajectory else TRAJECTORY
-            found, needed = f"episode {identity} has no {file}", f"a {file} in each episode"
-            raise InputError(where=self._path(folder, ""), found=found, needed=needed, fix=_FIX)
+            problem, needed = f"episode {identity} has no {file}", f"a {file} in each episode"
+            raise InputError(where=self._path(folder, ""), found=problem, needed=needed, fix=_FIX)
         version, path = hash_key({"files": listed}), self._path(folder, listed.metadata)
         metadata = parse_json_object(
             self._files.read(path, version=version), where=path, needed="the metadata of an episode"
@@ -145,10 +145,10 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             video = self._path(folder, f"{VIDEOS}/{serial}.mp4")
             names = [file.name for file in listed.videos]
             if f"{serial}.mp4" not in names:
-                found = f"no such file; existing MP4 files: {', '.join(names) or 'none'}"
+                problem = f"no such file; existing MP4 files: {', '.join(names) or 'none'}"
                 needed = f"the MP4 of a camera in {listed.metadata} or data.camera"
                 fix = f"{did_you_mean(serial, [*RAW_CAMERAS, *serial_by_camera.values()])}{_FIX}"
-                raise InputError(where=video, found=found, needed=needed, fix=fix)
+                raise InputError(where=video, found=problem, needed=needed, fix=fix)
             counts[serial] = read_header(video, where=video).num_frames
         location = _EpisodeLocation(folder, version, serial_by_camera, counts)
         states = _join_states(self._read_arrays(location, serials))
@@ -176,15 +176,14 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         steps = len(arrays["pose"])
         for serial, count in location.frames.items():
             if abs(steps - count) > 1:
-                found = f"{counted(steps, 'step')}, but {counted(count, 'frame')} in {serial}.mp4"
+                problem = f"{counted(steps, 'step')}, but {counted(count, 'frame')} in {serial}.mp4"
                 needed = "one frame for each step; only the last frame may be missing"
-                raise InputError(where=path, found=found, needed=needed, fix=_FIX)
+                raise InputError(where=path, found=problem, needed=needed, fix=_FIX)
         if self._config.pose_frame == "camera" and not arrays.keys() >= set(serials):
-            needed, fix = (
-                "the array observation/camera_extrinsics for each camera of data.camera",
-                "Set data.pose_frame: base",
+            needed = "the array observation/camera_extrinsics for each camera of data.camera"
+            raise InputError(
+                where=path, found="the camera poses are missing", needed=needed, fix="Set data.pose_frame: base"
             )
-            raise InputError(where=path, found="the camera poses are missing", needed=needed, fix=fix)
         used = np.arange(min(steps, *location.frames.values()))
         if "skipped" in arrays:
             used = used[arrays["skipped"][used, 0] == 0]
@@ -217,11 +216,11 @@ def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[st
                 if array_path in file:
                     arrays[name] = _read_array(file[array_path], width, f"{where}: {array_path}")
                 elif name in _REQUIRED:
-                    found = f"no such array; existing groups: {', '.join(sorted(file))[:200]}"
-                    raise InputError(where=f"{where}: {array_path}", found=found, fix=_FIX)
+                    problem = f"no such array; {_describe_nearest_group(file, array_path)}"
+                    raise InputError(where=f"{where}: {array_path}", found=problem, fix=_FIX)
     except (OSError, KeyError, ValueError, TypeError, RuntimeError, MemoryError, OverflowError) as error:
-        found = f"{len(data)} bytes that cannot be read as HDF5 ({str(error)[:200]})"
-        raise InputError(where=where, found=found, needed="an undamaged trajectory.h5", fix=_FIX) from None
+        problem = f"{len(data)} bytes that cannot be read as HDF5 ({str(error)[:200]})"
+        raise InputError(where=where, found=problem, needed="an undamaged trajectory.h5", fix=_FIX) from None
     steps = len(arrays["pose"])
     for name, values in arrays.items():
         if len(values) != steps:
@@ -231,13 +230,21 @@ def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[st
     return arrays
 
 
+def _describe_nearest_group(file: Any, array_path: str) -> str:
+    """Return the names in the deepest existing group of the path of a missing array, for a message."""
+    parents = [str(parent) for parent in PurePosixPath(array_path).parents]
+    group = next((parent for parent in parents if isinstance(file.get(parent), type(file["/"]))), "/")
+    name = f"group {group}" if group in parents[:-1] else "the file"
+    return f"{name} contains {', '.join(sorted(file[group]))[:200] or 'nothing'}"
+
+
 def _read_array(data: Any, width: int, where: str) -> Float[np.ndarray, "steps width"]:
     """Read an HDF5 array of `width` finite numbers per step; for width 1 the second axis may be missing."""
     shape, kind = tuple(getattr(data, "shape", None) or ()), getattr(getattr(data, "dtype", None), "kind", "?")
-    fits = shape[1:] == (width,) or (width == 1 and len(shape) == 1)
-    if not fits or shape[0] > _MAX_STEPS or kind not in "fiub":
-        found, needed = f"shape {shape} of dtype kind {kind!r}", f"{width} numbers for each step"
-        raise InputError(where=where, found=found, needed=needed, fix=_FIX)
+    has_width = shape[1:] == (width,) or (width == 1 and len(shape) == 1)
+    if not has_width or shape[0] > _MAX_STEPS or kind not in "fiub":
+        problem, needed = f"shape {shape} of dtype kind {kind!r}", f"{width} numbers for each step"
+        raise InputError(where=where, found=problem, needed=needed, fix=_FIX)
     values = np.asarray(data[()], dtype=np.float64).reshape(-1, width)
     require_finite(values, where, fix=_FIX)
     return values
@@ -257,8 +264,8 @@ def _parse_serial(metadata: Mapping[str, Any], camera: str) -> str | None:
 def _select_serial(serials: Mapping[str, str], camera: str, where: str) -> str:
     """Return the serial number of a camera, given by a name (left, right, wrist, ext1, ext2) or a serial number."""
     if camera in RAW_CAMERAS and camera not in serials:
-        found, fix = f"{camera}_mp4_path is missing or not an MP4", "Set data.camera to a camera of every episode"
-        raise InputError(where=where, found=found, needed="the path of an MP4 in the metadata", fix=fix)
+        problem, fix = f"{camera}_mp4_path is missing or not an MP4", "Set data.camera to a camera of every episode"
+        raise InputError(where=where, found=problem, needed="the path of an MP4 in the metadata", fix=fix)
     return serials.get(camera, camera)
 
 
@@ -320,9 +327,9 @@ def list_episode(root: str, folder: str) -> EpisodeFolder:
 
 
 def get_identity(root: str, folder: str) -> str:
-    """Return the identity of an episode: LAB/outcome/DATE/TIME if its full path ends so, for any `root` in the tree.
+    """Return the identity of an episode: LAB/outcome/DATE/TIME if its full path has this form, else its relative path.
 
-    Otherwise the identity is the path relative to `root`.
+    The identity in this form is the same for any `root` in the tree.
     """
     base = root.split("://", 1)[1] if storage.is_url(root) else str(Path(root).resolve())
     parts = [part for part in f"{base}/{folder}".split("/") if part]

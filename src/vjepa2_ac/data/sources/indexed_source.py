@@ -172,13 +172,13 @@ class IndexedSource(ABC, Generic[Config, State]):
             OSError: Data behind a URL cannot be read.
         """
 
-        def scan_one(key: str) -> ScanResult:
+        def scan_episode(key: str) -> ScanResult:
             try:
                 return scan(key)
             except InputError as error:
                 return EpisodeProblem.from_error(error, identities[key])
 
-        results = map_in_threads(scan_one, [*identities], num_connections(self._config))
+        results = map_in_threads(scan_episode, [*identities], num_connections(self._config))
         return build_table(results, self._config, len(identities), progress)
 
     @abstractmethod

@@ -4,7 +4,8 @@ cache.json     the full key of the cache
 episodes.npz   all episodes of the encoded data set, in its order, as `EpisodeTable.to_bytes` writes them
 kept.npz       the steps that `data.idle` keeps, as `StepSelection.to_bytes` writes them; absent without an idle rule
 episodes/000/000123-CAMERA.safetensors   the latents of an episode, by its index, and a camera
-episodes/000/000123-CAMERA.broken        instead: the reason why the episode is unreadable (`data.broken_episodes`)
+episodes/000/000123-CAMERA.broken        in its place, the reason why the episode cannot be read (see
+                                         `data.broken_episodes`)
 
 All files are written atomically, also behind a URL. A cache is finished when each episode that clips need has a file
 for each camera. The tensors of such a file (control steps as in `episode`; `frames` are the encoded steps):
@@ -97,7 +98,7 @@ class EncodedEpisode:
     camera: str
     steps: Sequence[int]  # control steps of the frames, ascending; there may be none
     latents: StoredLatents  # of these frames, see `pack_latents`
-    pictures: UInt8[np.ndarray, "frames size size 3"]  # the encoder's input images of these frames
+    images: UInt8[np.ndarray, "frames size size 3"]  # the encoder's input images of these frames
 
 
 @dataclass(frozen=True)
@@ -184,9 +185,9 @@ class LatentFiles:
             **{name: getattr(episode, name) for name in OPTIONAL},
         }
         if lossless_images:
-            arrays["pictures"] = encoded.pictures
+            arrays["pictures"] = encoded.images
         else:
-            jpegs = [encode_jpeg(frame, quality=_JPEG_QUALITY) for frame in encoded.pictures]
+            jpegs = [encode_jpeg(frame, quality=_JPEG_QUALITY) for frame in encoded.images]
             arrays["pictures"] = np.frombuffer(b"".join(jpegs), np.uint8)
             arrays["picture_ends"] = np.cumsum([len(jpeg) for jpeg in jpegs], dtype=np.int64)
         tensors = {
@@ -210,9 +211,8 @@ class LatentFiles:
         """The reasons of the episodes that could not be read, by the index of the episode."""
         sizes = self._sizes()
         notes = sorted(name for name in sizes if name.endswith(_BROKEN_SUFFIX))
-        broken = [
-            note for note in notes if note.removesuffix(_BROKEN_SUFFIX) + _LATENTS_SUFFIX not in sizes
-        ]  # else encoded later
+        # A note next to latents is outdated: the episode was encoded later.
+        broken = [note for note in notes if note.removesuffix(_BROKEN_SUFFIX) + _LATENTS_SUFFIX not in sizes]
         return {int(note.rpartition("/")[2].partition("-")[0]): self._read_reason(note) for note in broken}
 
     def _sizes(self) -> Mapping[str, int]:
@@ -354,8 +354,8 @@ class EpisodeFile:
         except (AttributeError, KeyError, IndexError, RuntimeError, ValueError, TypeError) as error:
             raise self._damage_error(f"not a complete file of latents ({error})") from None
 
-    def _damage_error(self, found: str, needed: str = "") -> InputError:
-        return InputError(where=self.path, found=found, needed=needed, fix=FIX)
+    def _damage_error(self, problem: str, needed: str = "") -> InputError:
+        return InputError(where=self.path, found=problem, needed=needed, fix=FIX)
 
 
 @dataclass(frozen=True)

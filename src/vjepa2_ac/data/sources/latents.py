@@ -50,7 +50,7 @@ class Encoding:
 
 @dataclass(frozen=True)
 class CacheKey:
-    """The values that determine the content of a folder, as {name: JSON value}; config keys have their own name."""
+    """The values that determine the content of a folder, as {name: JSON value}; config keys have their path as name."""
 
     parts: Mapping[str, Any]
 
@@ -105,7 +105,7 @@ def get_clip_parts(config: DataConfig) -> dict[str, Any]:
 
 
 def require_matching_folder(folder: Path | str, name: str, key: CacheKey, *, where: str) -> None:
-    """Refuse a folder that was begun with another key, or that holds other files; a missing folder is accepted.
+    """Refuse a folder that was created with another key, or that holds other files; a missing folder is accepted.
 
     Args:
         folder: The folder, or its URL.
@@ -124,13 +124,13 @@ def require_matching_folder(folder: Path | str, name: str, key: CacheKey, *, whe
         stored = read_json_object(storage.join(folder, name), fix=fix)
     except MissingFileError:
         if other_names:
-            found = f"the folder contains other files, such as {other_names[0]}"
-            raise InputError(where=where, found=found, needed="a new or empty folder", fix=fix) from None
+            problem = f"the folder contains other files, such as {other_names[0]}"
+            raise InputError(where=where, found=problem, needed="a new or empty folder", fix=fix) from None
         return
     if differing := CacheKey(stored.get("key") or {}).list_differences(key.parts):
-        found = f"the folder was created with different settings: {'; '.join(differing)}"
+        problem = f"the folder was created with different settings: {'; '.join(differing)}"
         needed = "a new folder, or a folder that was created with these settings"
-        raise InputError(where=where, found=found, needed=needed, fix=fix)
+        raise InputError(where=where, found=problem, needed=needed, fix=fix)
 
 
 def _compare_values(name: str, stored: Any, current: Any) -> list[str]:
@@ -153,16 +153,14 @@ def read_cache_key(folder: Path | str) -> CacheKey:
     Raises:
         InputError: The folder has no key, or one of another format.
     """
-    where, needed = (
-        storage.join(folder, CACHE_FILE),
-        f"a folder with the {CACHE_FILE} of a latent cache, format {FORMAT}",
-    )
+    where = storage.join(folder, CACHE_FILE)
+    needed = f"a folder with the {CACHE_FILE} of a latent cache, format {FORMAT}"
     try:
         key = read_json_object(where, fix=_ENCODE).get("key")
     except MissingFileError:
         is_folder = storage.is_url(folder) or Path(folder).is_dir()
-        found = "no latent cache" if is_folder else f"no such folder (working directory: {Path.cwd()})"
-        raise InputError(where=str(folder), found=found, needed=needed, fix=_ENCODE) from None
+        problem = "no latent cache" if is_folder else f"no such folder (working directory: {Path.cwd()})"
+        raise InputError(where=str(folder), found=problem, needed=needed, fix=_ENCODE) from None
     if not isinstance(key, dict) or key.get("format") != FORMAT or not isinstance(key.get("data.camera"), list):
         raise InputError(
             where=where, found="not the key of a latent cache, or an unsupported format", needed=needed, fix=_ENCODE
@@ -186,9 +184,11 @@ def read_table(path: str, kind: type[T]) -> T:
 
 @dataclass(frozen=True)
 class _Cache:
+    """An open latent cache."""
+
     key: CacheKey
     files: LatentFiles
-    kept: StepSelection | None
+    selected_steps: StepSelection | None
 
 
 class LatentSource(IndexedSource[DataConfig, _Cache]):
@@ -214,7 +214,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         Raises:
             InputError: There is no cache, or its clips differ from the config's.
         """
-        return self._open()[1].kept
+        return self._open()[1].selected_steps
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is fetched
         """Return an episode; only requested latents are read.
@@ -258,18 +258,18 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         """Check that some episodes have files, and return the config with the names of the cameras.
 
         Raises:
-            InputError: Some of these episodes have no files: the cache is unfinished, or was made from others.
+            InputError: Some of these episodes have no files: the cache is unfinished, or was made from other episodes.
             UnreachableError: The folder cannot be listed now.
         """
         table, opened = self._open()
         numbers = np.unique(episodes).tolist()
         if missing := opened.files.find_missing(numbers, self.cameras):
             count = f"{len(missing)} of {counted(len(numbers), 'episode')}"
-            found = f"no latents of {count}, such as {table.identity(missing[0])}"
+            problem = f"no latents of {count}, such as {table.identity(missing[0])}"
             fix = (
                 "Run the `vjepa2-ac encode` command of this cache again to encode the missing episodes, or exclude them"
             )
-            raise InputError(where=self._config.path, found=found, fix=f"{fix} (data.outcome, data.exclude)")
+            raise InputError(where=self._config.path, found=problem, fix=f"{fix} (data.outcome, data.exclude)")
         return self._config.model_copy(update={"camera": self.cameras})
 
     def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - opening a cache is fast
@@ -283,15 +283,15 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         if differing:  # the clips of the cache differ from the config's
             raise cache_mismatch_error(folder, differing)
         has_idle_rule = self._config.idle.rule != "none"
-        kept = read_table(storage.join(folder, STEPS_FILE), StepSelection) if has_idle_rule else None
+        selected_steps = read_table(storage.join(folder, STEPS_FILE), StepSelection) if has_idle_rule else None
         cache = open_download_cache(self._config.disk_cache) if storage.is_url(folder) else None
         table = read_table(storage.join(folder, EPISODES_FILE), EpisodeTable)
-        return table, _Cache(key, LatentFiles(folder, key.digest, cache), kept)
+        return table, _Cache(key, LatentFiles(folder, key.digest, cache), selected_steps)
 
 
 def cache_mismatch_error(folder: Path | str, differing: Sequence[str]) -> InputError:
     """Return the error of a cache with other settings than those in use."""
-    found = f"the latent cache was encoded with different settings: {'; '.join(differing)}"
+    problem = f"the latent cache was encoded with different settings: {'; '.join(differing)}"
     needed = "a latent cache that was encoded with this model and these settings"
     fix = "Change the settings to those of the cache, or encode the data set again"
-    return InputError(where=str(folder), found=found, needed=needed, fix=fix)
+    return InputError(where=str(folder), found=problem, needed=needed, fix=fix)

@@ -189,8 +189,8 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
                 raise missing_error("data.lerobot", "column", name, where, rows)
             feature, width = info.features.get(name), rows[name].shape[1]
             if feature is not None and width != feature.width:
-                found, needed = f"{width} numbers per row", f"{feature.width}, according to {info.where}"
-                raise InputError(where=f"{where}: {name}", found=found, needed=needed, fix=FIX_EPISODE)
+                problem, needed = f"{width} numbers per row", f"{feature.width}, according to {info.where}"
+                raise InputError(where=f"{where}: {name}", found=problem, needed=needed, fix=FIX_EPISODE)
             return rows[name].astype(np.float64)
 
         def concatenate(names: Sequence[str]) -> Float[np.ndarray, "steps width"]:
@@ -241,8 +241,8 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         if images is None:
             all_images = read_all()
             if len(all_images) != row.length:
-                found, needed = f"{len(all_images)} images", f"one image for each of {counted(row.length, 'step')}"
-                raise InputError(where=where, found=found, needed=needed)
+                problem, needed = f"{len(all_images)} images", f"one image for each of {counted(row.length, 'step')}"
+                raise InputError(where=where, found=problem, needed=needed)
             if int(self.infos().texts[_DATA_BYTES]) <= self._config.disk_cache.limit_gb * 1e9:
                 self._files.cache.write_parts(entry, all_images)
             images = [all_images[step] for step in steps]
@@ -273,14 +273,14 @@ def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
         )
     order = np.arange(length)
     if FRAME_COLUMN in rows and not np.array_equal(rows[FRAME_COLUMN][:, 0], order):
-        found = f"{FRAME_COLUMN} does not count from 0 to {length - 1}"
-        raise InputError(where=where, found=found, needed="one row for each step, in order", fix=FIX_EPISODE)
+        problem = f"{FRAME_COLUMN} does not count from 0 to {length - 1}"
+        raise InputError(where=where, found=problem, needed="one row for each step, in order", fix=FIX_EPISODE)
     if TIME_COLUMN not in rows:
         return
     errors_s = abs(rows[TIME_COLUMN][:, 0] - order / fps)
     if not errors_s.max() < 0.5 / fps:  # written this way, because a NaN is an error, too
         step = int(np.argmax(~(errors_s < 0.5 / fps)))
-        found = f"{TIME_COLUMN} {rows[TIME_COLUMN][step, 0]:.4g} s"
+        problem = f"{TIME_COLUMN} {rows[TIME_COLUMN][step, 0]:.4g} s"
         needed = f"{step / fps:.4g} s, at the {fps:g} rows per second of meta/info.json"
         fix = "Correct fps in meta/info.json, or exclude the episode"
-        raise InputError(where=f"{where}: step {step}", found=found, needed=needed, fix=fix)
+        raise InputError(where=f"{where}: step {step}", found=problem, needed=needed, fix=fix)

@@ -133,8 +133,8 @@ class DatasetInfo:
         if key not in cameras:
             raise missing_error(f"data.lerobot.cameras.{camera}", "camera", key, self.where, cameras)
         if self.features[key].dtype == "video" and self.video_path is None:
-            found = f"{key} is a video, but video_path is missing"
-            raise InputError(where=self.where, found=found, needed="the path template of the videos", fix=_FIX)
+            problem = f"{key} is a video, but video_path is missing"
+            raise InputError(where=self.where, found=problem, needed="the path template of the videos", fix=_FIX)
         return key
 
 
@@ -142,8 +142,8 @@ def missing_error(where: str, kind: str, name: str, container: str, existing: It
     """Return an error about a missing name, with the existing names and a suggestion."""
     existing = list(existing)
     needed = f"one of {', '.join(existing)}" if existing else ""
-    found = f"no {kind} {name} in {container}" + ("" if existing else f", which has no {kind}")
-    return InputError(where=where, found=found, needed=needed, fix=did_you_mean(name, existing).strip())
+    problem = f"no {kind} {name} in {container}" + ("" if existing else f", which has no {kind}")
+    return InputError(where=where, found=problem, needed=needed, fix=did_you_mean(name, existing).strip())
 
 
 def read_info(root: str) -> DatasetInfo:
@@ -158,19 +158,19 @@ def read_info(root: str) -> DatasetInfo:
         content = read_json_object(where, needed="a description of a data set", fix=_FIX)
     except MissingFileError:
         fix = _FIX_HUB if root.startswith("hf://") else "Set data.path to the folder with meta, data and videos"
-        found = f"no {INFO} in {root}"
-        raise InputError(where="data.path", found=found, needed="a LeRobot data set", fix=fix) from None
+        problem = f"no {INFO} in {root}"
+        raise InputError(where="data.path", found=problem, needed="a LeRobot data set", fix=fix) from None
     if (version := content.get("codebase_version")) not in VERSIONS:
-        found = f"codebase_version {version!r}"
-        raise InputError(where=where, found=found, needed=" or ".join(VERSIONS), fix=_FIX_VERSION)
+        problem = f"codebase_version {version!r}"
+        raise InputError(where=where, found=problem, needed=" or ".join(VERSIONS), fix=_FIX_VERSION)
     if (stored_as := content.get("storage_format") or "parquet") != "parquet":
-        found = f"storage_format {stored_as!r}"
-        raise InputError(where=where, found=found, needed="Parquet files and MP4 videos", fix=_FIX_STORAGE)
+        problem = f"storage_format {stored_as!r}"
+        raise InputError(where=where, found=problem, needed="Parquet files and MP4 videos", fix=_FIX_STORAGE)
     try:
         return _parse_info(root, content)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-        found = f"not a valid data set description ({error!r})"
-        raise InputError(where=where, found=found, needed="meta/info.json as written by LeRobot", fix=_FIX) from None
+        problem = f"not a valid data set description ({error!r})"
+        raise InputError(where=where, found=problem, needed="meta/info.json as written by LeRobot", fix=_FIX) from None
 
 
 def _parse_info(root: str, content: Mapping[str, Any]) -> DatasetInfo:
@@ -326,15 +326,15 @@ def read_episode_rows(
             try:
                 rows.append(_parse_row(info, row, videos, row.get(outcome)))
             except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-                found, needed = f"not an entry of an episode ({error!r})", "a table as written by LeRobot"
-                raise InputError(where=f"{path}: row {number}", found=found, needed=needed, fix=_FIX_TABLES) from None
+                problem, needed = f"not an entry of an episode ({error!r})", "a table as written by LeRobot"
+                raise InputError(where=f"{path}: row {number}", found=problem, needed=needed, fix=_FIX_TABLES) from None
     rows.sort(key=lambda row: row.index)
     numbers = {row.index for row in rows}
     if len(numbers) != len(rows) or len(rows) != info.episodes:
         where = storage.join(info.root, tables[0] if tables else "meta")
-        found = f"{counted(len(rows), 'episode')} with {len(numbers)} different values of episode_index"
+        problem = f"{counted(len(rows), 'episode')} with {len(numbers)} different values of episode_index"
         needed = f"{counted(info.episodes, 'episode')} with different values, according to {info.where}"
-        raise InputError(where=where, found=found, needed=needed, fix=_FIX_TABLES)
+        raise InputError(where=where, found=problem, needed=needed, fix=_FIX_TABLES)
     return rows
 
 
@@ -409,9 +409,9 @@ def require_files(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Seq
                 where=where, found="no such video", needed=f"the frames of {key} for {rows}", fix=FIX_EPISODE
             )
         if not row.lengths_s.get(key, math.inf) > (row.length - 0.5) / info.fps:
-            found = f"{row.lengths_s[key]:.3f} s of video according to the files in meta"
+            problem = f"{row.lengths_s[key]:.3f} s of video according to the files in meta"
             needed = f"{row.length / info.fps:.3f} s for {rows}"
-            raise InputError(where=where, found=found, needed=needed, fix="Exclude the episode")
+            raise InputError(where=where, found=problem, needed=needed, fix="Exclude the episode")
 
 
 def require_video_lengths(
@@ -433,11 +433,11 @@ def require_video_lengths(
             path = storage.join(info.root, row.video_file(info, key))
             header, last_s = read_header(path), row.locator[f"{key}.start_s"] + (row.length - 1) / info.fps
             if header.num_frames < row.length or header.span_s < last_s - 0.5 / info.fps:
-                found = (
+                problem = (
                     f"{header.num_frames} frames at {header.rate_hz:.4g} frames per second, up to {header.span_s:.3f} s"
                 )
                 needed = f"a frame for each of {row.length} rows at {info.fps:g} rows per second, up to {last_s:.3f} s"
-                raise InputError(where=f"{path}: {row.id}", found=found, needed=needed, fix=FIX_EPISODE)
+                raise InputError(where=f"{path}: {row.id}", found=problem, needed=needed, fix=FIX_EPISODE)
 
 
 def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[str]) -> dict[str, InputError]:
@@ -462,8 +462,8 @@ def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[
             end_s = min(end_s, latest[2])
             if path == latest[0] and end_s - start_s > _ROUNDING_STEPS / info.fps:
                 seconds = f"{start_s:.6g} to {end_s:.6g} s of {PurePosixPath(path).name}"
-                found, needed = f"{latest[3]} and {identity} both contain {seconds}", "no overlap between episodes"
-                error = InputError(where=storage.join(info.root, path), found=found, needed=needed, fix=_FIX_RANGES)
+                problem, needed = f"{latest[3]} and {identity} both contain {seconds}", "no overlap between episodes"
+                error = InputError(where=storage.join(info.root, path), found=problem, needed=needed, fix=_FIX_RANGES)
                 errors.setdefault(latest[3], error)
                 errors.setdefault(identity, error)
             latest = max(latest, segment, key=lambda item: (item[0], item[2]))

@@ -4,13 +4,13 @@ An episode NAME.npz, as numpy.savez or numpy.savez_compressed writes it, holds
 
     states             [steps, 7]  measured: x, y, z in metres, roll, pitch, yaw in radians (extrinsic xyz Euler),
                                    gripper closedness, 0 open .. 1 closed; all in the robot's base frame
-                                   ([steps, any] with data.states: vector: whatever the robot has)
+                                   ([steps, any] with data.states: vector: any numbers)
     frames             [steps, height, width, 3] uint8, RGB: the frame at each step
     fps_hz             control steps per second, the same in all episodes
 
 and may hold
 
-    any other name     more cameras, shaped as `frames`; `data.camera` chooses by name
+    any other name     more cameras, shaped as `frames`; `data.camera` selects cameras by name
     extrinsics         [6] or [steps, 6]: the camera in the base frame; extrinsics_CAMERA: that of one camera
     joint_velocities   [steps, joints], *commanded*, radians per second; used by the rule `commands` of the idle filter
     actions            [steps, any], *commanded*; read with data.actions: recorded
@@ -102,9 +102,9 @@ class NpzSource(IndexedSource[DataConfig, None]):
                 file.require_frames(camera, steps)
             extrinsics = [file.read_extrinsics(camera, steps) for camera in cameras]
             if config.pose_frame == "camera" and any(poses is None for poses in extrinsics):
-                found = "the camera poses are missing"
+                problem = "the camera poses are missing"
                 needed = "the array extrinsics, or extrinsics_CAMERA for each camera of data.camera"
-                raise InputError(where=path, found=found, needed=needed, fix="Set data.pose_frame: base")
+                raise InputError(where=path, found=problem, needed=needed, fix="Set data.pose_frame: base")
             fps_hz = float(file.read_numbers("fps_hz", ()))
             if fps_hz <= 0:
                 raise file.array_error("fps_hz", f"{fps_hz:g}", "a positive number of control steps per second")
@@ -145,8 +145,8 @@ class NpzSource(IndexedSource[DataConfig, None]):
             if file.name.endswith(_SUFFIX)
         )
         if not listed:
-            found = f"no .npz files under {root}"
-            raise InputError(where="data.path", found=found, needed="one .npz file for each episode", fix=FORMAT_HELP)
+            problem = f"no .npz files under {root}"
+            raise InputError(where="data.path", found=problem, needed="one .npz file for each episode", fix=FORMAT_HELP)
         config_values: dict[str, object] = {"cameras": config.cameras, "pose_frame": config.pose_frame}
         if config.states == "vector":
             config_values |= {"states": config.states, "actions": config.actions}
@@ -268,9 +268,9 @@ class NpzFile:
                 values[index] = np.frombuffer(file.read(header.row_bytes), header.dtype).reshape(header.shape[1:])
             return values if (indices == np.arange(len(rows))).all() else values[indices]
 
-    def array_error(self, name: str, found: str, needed: str) -> InputError:
+    def array_error(self, name: str, problem: str, needed: str) -> InputError:
         """Return an error about an array."""
-        return InputError(where=f"{self._where}: {name}", found=found, needed=needed, fix=FORMAT_HELP)
+        return InputError(where=f"{self._where}: {name}", found=problem, needed=needed, fix=FORMAT_HELP)
 
     def read_numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
         """Read an array of finite numbers of a shape, in which None stands for any length."""
@@ -294,8 +294,8 @@ class NpzFile:
         """Return the poses of a camera at all steps (repeated for a fixed camera), or None if there are none."""
         for name in (f"extrinsics_{camera}", "extrinsics"):
             if name in self.names:
-                one_pose = len(self.read_header(name).shape) == 1
-                values = self.read_numbers(name, (EXTRINSICS_DIM,) if one_pose else (steps, EXTRINSICS_DIM))
+                is_single_pose = len(self.read_header(name).shape) == 1
+                values = self.read_numbers(name, (EXTRINSICS_DIM,) if is_single_pose else (steps, EXTRINSICS_DIM))
                 return np.broadcast_to(values, (steps, EXTRINSICS_DIM))
         return None
 
@@ -343,5 +343,5 @@ class NpzFile:
             if storage.is_os_read_error(error):
                 raise
             where = f"{self._where}: {name}" if name else self._where
-            found = f"cannot be read ({str(error)[:200] or type(error).__name__})"
-            raise InputError(where=where, found=found, needed="an undamaged .npz file", fix=_FIX) from None
+            problem = f"cannot be read ({str(error)[:200] or type(error).__name__})"
+            raise InputError(where=where, found=problem, needed="an undamaged .npz file", fix=_FIX) from None

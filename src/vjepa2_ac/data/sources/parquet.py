@@ -17,7 +17,7 @@ from jaxtyping import Shaped
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.files import EpisodeFiles
-from vjepa2_ac.errors import InputError, require_library
+from vjepa2_ac.errors import InputError, counted, require_library
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
 if TYPE_CHECKING:
@@ -87,8 +87,11 @@ class ParquetRows:
                     selected = [row for row, row_episode in rows if row_episode == episode]
                     images += [row.get("bytes") if isinstance(row, dict) else row for row in selected]
         if not all(isinstance(image, bytes) for image in images):
-            found, needed = "values that are not encoded images, such as file names", "PNG or JPEG bytes in the column"
-            raise InputError(where=f"{path}: {column}", found=found, needed=needed)
+            raise InputError(
+                where=f"{path}: {column}",
+                found="values that are not encoded images, such as file names",
+                needed="PNG or JPEG bytes in the column",
+            )
         return images
 
     @contextmanager
@@ -143,8 +146,8 @@ def to_numbers(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
             raise _not_numeric_error(where, str(column.type), array.null_count)
         lengths = np.unique(array.value_lengths().to_numpy(zero_copy_only=False))
         if len(lengths) > 1:
-            found = f"{lengths[0]} numbers in one row and {lengths[-1]} in another row"
-            raise InputError(where=where, found=found, needed="the same count of numbers in each row")
+            problem = f"{lengths[0]} numbers in one row and {lengths[-1]} in another row"
+            raise InputError(where=where, found=problem, needed="the same count of numbers in each row")
         width *= int(lengths[0]) if len(lengths) else 0
         array = array.flatten()
     kind = array.type
@@ -154,8 +157,8 @@ def to_numbers(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
 
 
 def _not_numeric_error(where: str, kind: str, num_nulls: int) -> InputError:
-    found = f"{num_nulls} rows without a value" if num_nulls else f"values of type {kind}"
-    return InputError(where=where, found=found, needed="the same count of numbers in each row", fix=_FIX)
+    problem = f"{counted(num_nulls, 'row')} without a value" if num_nulls else f"values of type {kind}"
+    return InputError(where=where, found=problem, needed="the same count of numbers in each row", fix=_FIX)
 
 
 @contextmanager
@@ -172,8 +175,8 @@ def _open_parquet(source: str | BlockCachedFile, path: str) -> Iterator[parquet.
             raise source.failure from None
         if isinstance(error, OSError) and error.errno is not None:  # an error of the operating system
             raise storage.read_error(path, error, fix=_FIX) from None
-        found = f"the file is damaged: {' '.join(str(error).strip().splitlines()[:1])[:200]}"
-        raise InputError(where=path, found=found, needed="a complete Parquet file", fix=_FIX) from None
+        problem = f"the file is damaged: {' '.join(str(error).strip().splitlines()[:1])[:200]}"
+        raise InputError(where=path, found=problem, needed="a complete Parquet file", fix=_FIX) from None
 
 
 def _read_episode_ranges(
@@ -195,8 +198,8 @@ def _read_episode_ranges(
         group = file.metadata.row_group(number)
         for index in indices:
             if (count := group.column(index).num_values) > MAX_NUMBERS:
-                found, needed = f"{count:,} numbers in a row group", f"at most {MAX_NUMBERS:,}"
-                raise InputError(where=f"{path}: {paths[index]}", found=found, needed=needed, fix=_FIX)
+                problem, needed = f"{count:,} numbers in a row group", f"at most {MAX_NUMBERS:,}"
+                raise InputError(where=f"{path}: {paths[index]}", found=problem, needed=needed, fix=_FIX)
         statistics = group.column(paths.index(EPISODE_COLUMN)).statistics
         has_range = statistics is not None and statistics.has_min_max and isinstance(statistics.min, int)
         ranges.append((statistics.min, statistics.max) if has_range else (-inf, inf))
@@ -234,8 +237,8 @@ def _read_parts(
         values = part.to_pydict()
         total += _estimate_bytes(values)
         if total > max_bytes:
-            found = f"more than {max_bytes:,} bytes of {', '.join(columns)[:200]}"
-            raise InputError(where=path, found=found, needed="a table that fits into memory", fix=_FIX)
+            problem = f"more than {max_bytes:,} bytes of {', '.join(columns)[:200]}"
+            raise InputError(where=path, found=problem, needed="a table that fits into memory", fix=_FIX)
         yield values
 
 

@@ -2,7 +2,7 @@
 
 For a record behind a URL, the positions of its features and images are cached on this machine without limit (about 4 KB
 per episode). Its numbers, and the images of steps that clips may come from, are cached within the limit of
-`data.disk_cache`. The first read fetches all images of the camera, because their positions are not known otherwise.
+`data.disk_cache`. The first read fetches all images of the camera, because their positions are unknown until then.
 Later reads fetch exactly the images of a clip that are not cached; fixed blocks would be several times as large.
 """
 
@@ -40,7 +40,7 @@ from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.media.images import decode_images
 from vjepa2_ac.storage.remote import read_adjacent_ranges
 
-_CHECKED = b"\xc3"  # not all bits equal, so that a damaged file seldom contains false marks
+_CHECKED = b"\xc3"  # neither 0x00 nor 0xff, so that a damaged file seldom contains false marks
 _GAP_BYTES = 1 << 15  # images at most this far apart are fetched with one request
 _CHUNK_BYTES = 1 << 20  # all of a camera's images are fetched in parallel chunks of this size
 
@@ -157,13 +157,15 @@ class RemoteEpisode:
             UnreachableError: The network fails.
         """
         feature_ranges = self._find_features()
-        places = [feature_ranges[name] for name in names if name in feature_ranges]
+        ranges = [feature_ranges[name] for name in names if name in feature_ranges]
         key = f"{self._key} {' '.join(names)}"
         with storage.translate_read_errors(self._shard.path, needed=NEEDED_FILE):
-            data = self._contents.read_or_create(key, lambda: b"".join(storage.read_ranges(self._shard.path, places)))
-        ends = np.cumsum([length for _, length in places]).tolist()
-        pieces = {place: data[end - place[1] : end] for place, end in zip(places, ends, strict=True)}
-        return Record(lambda *place: pieces[place], self._span, feature_ranges)
+            data = self._contents.read_or_create(key, lambda: b"".join(storage.read_ranges(self._shard.path, ranges)))
+        ends = np.cumsum([length for _, length in ranges]).tolist()
+        pieces = {
+            (offset, length): data[end - length : end] for (offset, length), end in zip(ranges, ends, strict=True)
+        }
+        return Record(lambda *byte_range: pieces[byte_range], self._span, feature_ranges)
 
     def make_image_reader(
         self, name: str, feature: ByteRange, num_steps: int, needed: StepRanges | None, where: str
@@ -197,7 +199,7 @@ class RemoteEpisode:
                 return json.dumps(Record(read, self._span).feature_ranges).encode()
 
         feature_ranges = json.loads(self._positions.read_or_create(self._key, locate))
-        return {name: tuple(place) for name, place in feature_ranges.items()}
+        return {name: tuple(byte_range) for name, byte_range in feature_ranges.items()}
 
     def _fetch_all(
         self, key: str, feature: ByteRange, num_steps: int, needed: StepRanges | None, where: str
@@ -236,7 +238,7 @@ def _find_images(read: ReadBytes, feature: ByteRange, num_steps: int, where: str
     except NotAnExampleError as error:
         raise InputError(where=where, found=str(error), needed="a list of images") from None
     if len(ranges) != num_steps:
-        found = f"{len(ranges)} images" if len(ranges) < num_steps else f"more than {counted(num_steps, 'image')}"
+        problem = f"{len(ranges)} images" if len(ranges) < num_steps else f"more than {counted(num_steps, 'image')}"
         needed = f"one image for each of the {counted(num_steps, 'step')}"
-        raise InputError(where=where, found=found, needed=needed)
+        raise InputError(where=where, found=problem, needed=needed)
     return ranges

@@ -7,6 +7,7 @@ when the episode is read.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any
@@ -85,8 +86,8 @@ class Record:
                 if any(ranges.keys() >= names for names in sufficient):
                     break
         except NotAnExampleError as error:
-            found = f"not a tf.train.Example ({error})"
-            raise InputError(where=str(self._span), found=found, needed="an RLDS data set") from None
+            problem = f"not a tf.train.Example ({error})"
+            raise InputError(where=str(self._span), found=problem, needed="an RLDS data set") from None
         return ranges
 
     def find_feature(self, name: str) -> ByteRange:
@@ -97,8 +98,8 @@ class Record:
         """
         if name not in self.feature_ranges:
             names = sorted(self.feature_ranges)
-            found = f"no feature {name}; existing features: {', '.join(names) or 'none'}"
-            raise InputError(where=str(self._span), found=found, fix=f"{did_you_mean(name, names)}Set data.fields")
+            problem = f"no feature {name}; existing features: {', '.join(names) or 'none'}"
+            raise InputError(where=str(self._span), found=problem, fix=f"{did_you_mean(name, names)}Set data.fields")
         return self.feature_ranges[name]
 
     def read_values(self, name: str, *kinds: Kind) -> Sequence[Any] | np.ndarray:
@@ -141,8 +142,8 @@ def read_identity(record: Record, fields: RldsFields) -> str:
             raise InputError(where=error.where, found=error.found, needed=error.needed, fix=_FIX_IDENTITY) from None
         parts += [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
     if not any(parts):
-        found = f"the identity is empty ({', '.join(fields.identity)})"
-        raise InputError(where=record.position, found=found, needed="a text or a number", fix=_FIX_IDENTITY)
+        problem = f"the identity is empty ({', '.join(fields.identity)})"
+        raise InputError(where=record.position, found=problem, needed="a text or a number", fix=_FIX_IDENTITY)
     return IDENTITY_SEPARATOR.join(parts)
 
 
@@ -234,8 +235,8 @@ def read_commands(
 def _read_per_step(record: Record, name: str, steps: int, where: str) -> Float[np.ndarray, "steps width"]:
     values = np.asarray(record.read_values(name, *_NUMBERS), np.float64)
     if len(values) == 0 or len(values) % steps:
-        found, needed = f"{len(values)} numbers", f"the same count for each of {counted(steps, 'step')}"
-        raise InputError(where=f"{where}: {name}", found=found, needed=needed)
+        problem, needed = f"{len(values)} numbers", f"the same count for each of {counted(steps, 'step')}"
+        raise InputError(where=f"{where}: {name}", found=problem, needed=needed)
     return values.reshape(steps, -1)
 
 
@@ -266,7 +267,7 @@ def build_index(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str
         with open_shard(shards[number]) as read:
             return list(_scan_shard(shards[number], number, read, config, cameras))
 
-    results = (result for of_shard in map_in_threads(scan, range(len(shards)), threads) for result in of_shard)
+    results = itertools.chain.from_iterable(map_in_threads(scan, range(len(shards)), threads))
     return build_table(results, config, sum(shard.episodes for shard in shards), progress)
 
 
@@ -299,10 +300,10 @@ def _scan_shard(
         yield _make_count_problem(shard, shard.episodes, f"{shard.size - offset:,} bytes after the last record")
 
 
-def _make_count_problem(shard: Shard, number: int, found: str) -> EpisodeProblem:
+def _make_count_problem(shard: Shard, number: int, problem: str) -> EpisodeProblem:
     name, where = f"{shard.name}: record {number}", f"{shard.path}: record {number}"
     needed = f"{shard.episodes} records, according to dataset_info.json"
-    return EpisodeProblem(name, where, found, needed, "Download the file again")
+    return EpisodeProblem(name, where, problem, needed, "Download the file again")
 
 
 def _scan_record(
@@ -312,8 +313,10 @@ def _scan_record(
     is_remote, fields, record = storage.is_url(span.path), config.fields, Record(read, span)
     try:
         if is_remote:
-            by_states = [{*fields.identity_features, *fields.state}] if config.states == "pose" else []
-            record = Record(read, span, record.locate([{*fields.identity_features, STEP_FLAG}, *by_states]))
+            sufficient = [{*fields.identity_features, STEP_FLAG}]
+            if config.states == "pose":
+                sufficient.append({*fields.identity_features, *fields.state})
+            record = Record(read, span, record.locate(sufficient))
         name = read_identity(record, fields)
         states = None if is_remote else _read_checked_states(record, config, cameras, f"{span} ({name})")
         steps = read_num_steps(record, config) if states is None else len(states)
@@ -322,9 +325,8 @@ def _scan_record(
     except InputError as error:
         return EpisodeProblem.from_error(error if is_remote else _prefer_crc_error(error, read, span), name)
     locator = dict(zip(_LOCATOR_COLUMNS, (shard, span.number, span.offset, span.length), strict=True))
-    success = (
-        True if "/success/" in name else False if "/failure/" in name else None
-    )  # only DROID's identities contain the outcome
+    # Only the identities of DROID contain the outcome.
+    success = True if "/success/" in name else False if "/failure/" in name else None
     info = EpisodeInfo(id=name, num_steps=steps, success=success)
     return IndexEntry(info, str(span), locator, STATES_NOT_READ if states is None else summarize_states(states))
 

@@ -55,16 +55,16 @@ def find_shards(folder: str) -> list[Shard]:
     try:
         listed = [shard for split in info["splits"] for shard in _list_shards(split, str(info["name"]))]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        found = f"not a valid data set description ({error!r})"
-        raise InputError(where=where, found=found, needed=f"a {_INFO} as written by TFDS") from None
+        problem = f"not a valid data set description ({error!r})"
+        raise InputError(where=where, found=problem, needed=f"a {_INFO} as written by TFDS") from None
     if not listed:
         raise InputError(where=where, found="no episodes in any split", needed="a data set with episodes")
     names = [name for name, *_ in listed]
     present = {file.name: file for file in storage.list_files(folder)}
     if missing := [name for name in names if name not in present]:
-        found = f"{len(missing)} of {len(names)} shards are missing: {format_identities(missing)}"
+        problem = f"{len(missing)} of {len(names)} shards are missing: {format_identities(missing)}"
         fix = f"Download them, or rename the existing files to the names in {_INFO}"
-        raise InputError(where=folder, found=found, needed=f"every shard that {_INFO} lists", fix=fix)
+        raise InputError(where=folder, found=problem, needed=f"every shard that {_INFO} lists", fix=fix)
     return [
         Shard(storage.join(folder, name), count, present[name].size, present[name].version, split)
         for name, count, split in listed
@@ -85,19 +85,18 @@ def _read_info(folder: str, where: str) -> dict[str, Any]:
         return read_json_object(where, needed=f"a {_INFO} as written by TFDS")
     except MissingFileError:
         fix = "Set data.path to the data set; docs/QUICKSTART.md describes how to download DROID"
-        found, needed = _describe_missing_info(folder), f"a folder with {_INFO}"
-        raise InputError(where="data.path", found=found, needed=needed, fix=fix) from None
+        problem, needed = _describe_missing_info(folder), f"a folder with {_INFO}"
+        raise InputError(where="data.path", found=problem, needed=needed, fix=fix) from None
 
 
 def _describe_missing_info(folder: str) -> str:
     names = storage.list_names(folder)
     if not names:
         return f"{folder} {'is empty' if storage.exists(folder) else 'does not exist'}"
-    inner = [name for name in names if storage.exists(storage.join(storage.join(folder, name), _INFO))]
-    if inner:
-        return (
-            f"no {_INFO} in {folder}; did you mean {format_identities([storage.join(folder, name) for name in inner])}?"
-        )
+    paths = [storage.join(folder, name) for name in names]
+    subfolders = [path for path in paths if storage.exists(storage.join(path, _INFO))]
+    if subfolders:
+        return f"no {_INFO} in {folder}; did you mean {format_identities(subfolders)}?"
     return f"no {_INFO} in {folder}, which contains {format_identities(names)}"
 
 
@@ -118,15 +117,16 @@ def _list_shards(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int
         }
         template = split.get("filepathTemplate") or _DEFAULT_TEMPLATE
         if count:
-            name = re.sub(r"\{(\w+)\}", lambda found, of=values: of.get(found[1], found[0]), template)
+            name = re.sub(r"\{(\w+)\}", lambda match, of=values: of.get(match[1], match[0]), template)
             yield name, count, values["SPLIT"]
 
 
 @contextmanager
 def open_shard(shard: Shard) -> Iterator[ReadBytes]:
-    """Open a shard for reads of small parts; a local shard may be read by several threads, a remote one by one.
+    """Open a shard for reads of small parts.
 
-    The file is not mapped into memory, so that truncating a local file during use causes short reads, not a crash.
+    Several threads may read a local shard concurrently, but only one thread a remote shard. The file is not mapped
+    into memory, so that truncating a local file during use causes short reads, not a crash.
 
     Raises:
         InputError: The file cannot be read, or a local one has changed since the data set was opened.
@@ -140,9 +140,9 @@ def open_shard(shard: Shard) -> Iterator[ReadBytes]:
         try:
             status = os.fstat(handle)
             if (status.st_size, str(status.st_mtime_ns)) != (shard.size, shard.version):
-                found = f"{status.st_size:,} bytes: the file has changed since the data set was opened"
+                problem = f"{status.st_size:,} bytes: the file has changed since the data set was opened"
                 needed = f"the original file of {shard.size:,} bytes"
-                raise InputError(where=shard.path, found=found, needed=needed, fix="Run the command again")
+                raise InputError(where=shard.path, found=problem, needed=needed, fix="Run the command again")
             yield lambda offset, length: os.pread(handle, length, offset)
         finally:
             os.close(handle)

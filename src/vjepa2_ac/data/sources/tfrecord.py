@@ -82,8 +82,8 @@ def parse_header(header: bytes, path: str, number: int, offset: int, size: int) 
         raise _truncated_error(where, size, offset + HEADER_BYTES)
     length, crc = struct.unpack_from("<QI", header)
     if crc != _masked_crc(header[:8]):
-        found = "the CRC of the record length does not match, so the file is damaged or not a TFRecord file"
-        raise InputError(where=where, found=found, needed="a TFRecord file as written by TFDS")
+        problem = "the CRC of the record length does not match, so the file is damaged or not a TFRecord file"
+        raise InputError(where=where, found=problem, needed="a TFRecord file as written by TFDS")
     span = RecordSpan(path=path, number=number, offset=offset, length=length)
     if span.end > size:
         raise _truncated_error(where, size, span.end)
@@ -107,8 +107,8 @@ def verify_crc(read: ReadBytes, span: RecordSpan) -> None:
     if len(footer) < _FOOTER_BYTES:
         raise _truncated_error(str(span), end + len(footer), span.end)
     if _mask(crc) != struct.unpack("<I", footer)[0]:
-        found = "the CRC of the data does not match, so the file is damaged"
-        raise InputError(where=str(span), found=found, fix="Download the file again")
+        problem = "the CRC of the data does not match, so the file is damaged"
+        raise InputError(where=str(span), found=problem, fix="Download the file again")
 
 
 class NotAnExampleError(ValueError):
@@ -207,8 +207,8 @@ def encode_entry(name: str, kind: Kind, values: Sequence[Any] | np.ndarray) -> b
 
 
 def _truncated_error(where: str, size: int, needed: int) -> InputError:
-    found = f"the file is truncated: it ends after {size:,} bytes, within this record"
-    return InputError(where=where, found=found, needed=f"at least {needed:,} bytes", fix="Download the file again")
+    problem = f"the file is truncated: it ends after {size:,} bytes, within this record"
+    return InputError(where=where, found=problem, needed=f"at least {needed:,} bytes", fix="Download the file again")
 
 
 def _masked_crc(data: bytes) -> int:
