@@ -46,7 +46,7 @@ class Count(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
         tensors = [*given, *_tensors(out)]
         for tensor in tensors:
             if _device(tensor) == "cuda":
-                self.storages.hold(tensor)
+                self.storages.count(tensor)
                 self._read = None
         self.waits += _copies_and_blocks(func, args, kwargs, set(map(_device, tensors)))
         return out

@@ -5,8 +5,9 @@ WORLD_SIZE, MASTER_ADDR and MASTER_PORT. Gradients are summed once per optimizer
 not by DistributedDataParallel: a process may have no clip in a micro-batch (`data.broken_episodes: skip`), for which
 DistributedDataParallel would wait forever.
 
-What only some processes do may take hours (an index, a checkpoint on a slow disk) or fail: `run_on_first`,
-`run_first_per_machine` and `run_on_all` let the others wait for it without a time-out, and raise its error in all.
+Work that only some processes do may take hours (an index, a checkpoint on a slow disk) or fail. `run_on_first`,
+`run_first_per_machine` and `run_on_all` let the other processes wait without a timeout, and raise an error of the work
+in all processes.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ def select_device(training: TrainingConfig) -> torch.device:
     device = torch.device("cpu") if on_cpu else torch.device("cuda", cuda_index())
     if training.precision == "bf16":  # fp32 is for float32 weights only, and fp16 casts any weights
         fix = f"Set training.precision={'fp32 with model.dtype=float32' if on_cpu else 'fp16'}"
-        _require_bf16(device, where="training.precision", found="bf16", fix=fix)
+        _require_bf16(device, where="training.precision", value="bf16", fix=fix)
     return device
 
 
@@ -110,7 +111,7 @@ def require_weight_dtype(model: ModelConfig, device: torch.device) -> None:
         InputError: The type is bfloat16 and the GPU does not support it.
     """
     if model.dtype == "bfloat16":
-        _require_bf16(device, where="model.dtype", found="bfloat16", fix="Set model.dtype=float32")
+        _require_bf16(device, where="model.dtype", value="bfloat16", fix="Set model.dtype=float32")
 
 
 def bf16_slowdown() -> str | None:
@@ -160,23 +161,23 @@ def autocast(training: TrainingConfig, device: torch.device) -> torch.autocast:
     return torch.autocast(device.type, dtype=kind, enabled=kind is not None)
 
 
-def _require_bf16(device: torch.device, *, where: str, found: str, fix: str) -> None:
+def _require_bf16(device: torch.device, *, where: str, value: str, fix: str) -> None:
     """Raise if a GPU only emulates bfloat16; log a warning if a CPU is slow with it."""
     if device.type == "cpu":
-        _warn(f"{where}: {found}", fix)
+        _warn(f"{where}: {value}", fix)
     if device.type != "cuda" or has_bf16(device):
         return
     index = _index_of(device)
     major, minor = torch.cuda.get_device_capability(index)
-    found += f", on {torch.cuda.get_device_name(index)} of compute capability {major}.{minor}"
+    problem = f"{value}, on {torch.cuda.get_device_name(index)} of compute capability {major}.{minor}"
     needed = "8.0 or more (Ampere or later): earlier GPUs only emulate bfloat16"
-    raise InputError(where=where, found=found, needed=needed, fix=fix)
+    raise InputError(where=where, found=problem, needed=needed, fix=fix)
 
 
 @cache  # warns once
-def _warn(found: str, fix: str) -> None:
+def _warn(setting: str, fix: str) -> None:
     if slow := bf16_slowdown():
-        _log.warning("%s: %s. %s", found, slow, fix)
+        _log.warning("%s: %s. %s", setting, slow, fix)
 
 
 # ---- processes ----
@@ -192,15 +193,19 @@ def make_accelerator(config: Config) -> Accelerator:
     """
     for name in _UNSUPPORTED_MODES:
         if os.environ.get(f"ACCELERATE_USE_{name}", "false").lower() in {"1", "true", "yes", "on"}:
-            found, needed = f"{name} is enabled", "data-parallel processes, each with the whole model"
-            raise InputError(where="accelerate launch", found=found, needed=needed, fix=f"Disable {name}")
+            raise InputError(
+                where="accelerate launch",
+                found=f"{name} is enabled",
+                needed="data-parallel processes, each with the whole model",
+                fix=f"Disable {name}",
+            )
     keeps_store = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
     if keeps_store and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0":
-        found = (
+        problem = (
             "--max-restarts with a store that all starts share, so a restart would wait for processes that have exited"
         )
         fix = f"Set {_SHARED_STORE}=1 in the environment of torchrun, which needs --rdzv-backend=c10d"
-        raise InputError(where="torchrun", found=found, needed="a separate store for each start", fix=fix)
+        raise InputError(where="torchrun", found=problem, needed="a separate store for each start", fix=fix)
     training, on_cpu = config.training, select_device(config.training).type == "cpu"
     _patient_group.cache_clear()
     _join_process_group("gloo" if on_cpu else "nccl")
@@ -223,22 +228,22 @@ def _join_process_group(backend: str) -> None:
     if (rank or "0", size or "1") == ("0", "1") or torch.distributed.is_initialized():
         return
     if not (rank.isdigit() and size.isdigit() and int(rank) < int(size) and address and port.isdigit()):
-        found = " ".join(f"{name}={os.environ[name]}" for name in _LAUNCHER if name in os.environ)
-        raise InputError(where="environment", found=found, needed=f"all of {', '.join(_LAUNCHER)}", fix=_UNSET)
+        variables = " ".join(f"{name}={os.environ[name]}" for name in _LAUNCHER if name in os.environ)
+        raise InputError(where="environment", found=variables, needed=f"all of {', '.join(_LAUNCHER)}", fix=_UNSET)
     joining: Future[Any] = Future()
     # A separate thread, so that this one can handle signals.
     threading.Thread(target=_rendezvous, args=[joining], daemon=True).start()
     if not wait([joining], _REPORT_AFTER_S).done:
-        others = f"process {2 - int(rank)} of 2" if size == "2" else f"the other {int(size) - 1} of {size} processes"
-        _log.warning("Waiting for %s at %s:%s. %s", others, address, port, _UNSET)
+        missing = f"process {2 - int(rank)} of 2" if size == "2" else f"the other {int(size) - 1} of {size} processes"
+        _log.warning("Waiting for %s at %s:%s. %s", missing, address, port, _UNSET)
     try:
         store, number, processes = joining.result()
     except RuntimeError as error:  # torch's DistError
         joined = re.search(r"(\d+)/\d+ clients joined", str(error))
-        found = f"Only {joined[1]} of {size} processes" if joined else f"Not all {size} processes"
-        found = f"{found} joined within {_JOIN_TIMEOUT.total_seconds() / 60:.3g} minutes ({error})"
+        count = f"Only {joined[1]} of {size} processes" if joined else f"Not all {size} processes"
+        problem = f"{count} joined within {_JOIN_TIMEOUT.total_seconds() / 60:.3g} minutes ({error})"
         fix = "Check the output of the other processes, and whether they can reach MASTER_ADDR"
-        raise UnreachableError(where="processes of this run", found=found, fix=fix) from None
+        raise UnreachableError(where="processes of this run", found=problem, fix=fix) from None
     store.set_timeout(_COLLECTIVE_TIMEOUT)
     torch.distributed.init_process_group(
         backend, store=store, rank=number, world_size=processes, timeout=_COLLECTIVE_TIMEOUT
@@ -284,20 +289,17 @@ def run_on_all(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
     result, error = None, None
     try:
         result = work()
-    except Exception as own_error:
-        error = own_error
+    except Exception as raised:
+        error = raised
     raise_first_error(accelerator, error)
     return result  # type: ignore[return-value]  # without an error it is set
 
 
 def raise_first_error(accelerator: Accelerator, error: Exception | None) -> None:
     """Raise the error of the first process that has one, in all processes. All processes must call this."""
-    sent = (
-        error
-        if error is None or isinstance(error, UserError)
-        else _OtherProcessError(f"{type(error).__name__}: {error}")
-    )
-    _raise_first_of(all_gather_object(accelerator, sent), accelerator.process_index, error)
+    is_unexpected = error is not None and not isinstance(error, UserError)
+    message = _OtherProcessError(f"{type(error).__name__}: {error}") if is_unexpected else error
+    _raise_first_of(all_gather_object(accelerator, message), accelerator.process_index, error)
 
 
 class _OtherProcessError(RuntimeError):
@@ -368,10 +370,10 @@ def require_same(accelerator: Accelerator, value: object, *, what: str, fix: str
         InputError: The values differ; raised in all processes, with the ranks that differ.
     """
     values = all_gather_object(accelerator, value)
-    differing = [str(rank) for rank, other in enumerate(values) if other != values[0]]
+    differing = [str(rank) for rank, value in enumerate(values) if value != values[0]]
     if differing:
-        found = f"a different value in process {', '.join(differing)} than in process 0"
-        raise InputError(where=what, found=found, needed="the same for all processes of a run", fix=fix)
+        differences = f"a different value in process {', '.join(differing)} than in process 0"
+        raise InputError(where=what, found=differences, needed="the same for all processes of a run", fix=fix)
 
 
 @cache
@@ -402,8 +404,8 @@ def share_work(accelerator: Accelerator) -> Iterator[None]:
         yield
     except _GatheredError as gathered:  # all processes have it
         raise gathered.error from None
-    except Exception as own_error:
-        error = own_error
+    except Exception as raised:
+        error = raised
     finally:
         _sharing = None
     raise_first_error(accelerator, error)

@@ -120,8 +120,8 @@ def describe_error(error: BaseException) -> str:
     if isinstance(error, OSError) and (
         error.errno in _NO_MORE_FILES or (error.filename and error.errno in _NO_PERMISSION)
     ):
-        found, fix = describe_refusal(error)
-        return str(InputError(where=str(error.filename or "ulimit -n"), found=found, fix=fix))
+        problem, fix = describe_refusal(error)
+        return str(InputError(where=str(error.filename or "ulimit -n"), found=problem, fix=fix))
     if not is_out_of_memory(error):
         return str(error)
     message = str(error).splitlines()[0] if str(error) else "MemoryError"
@@ -141,7 +141,7 @@ def describe_refusal(error: OSError) -> tuple[str, str]:
         return reason, "Check its permissions, and the disk"
     path = Path(str(error.filename)).absolute()
     # If a parent folder is not readable, it is named instead of the file; Path.exists would raise.
-    existing = next(one for one in (path, *path.parents) if os.path.exists(one))  # noqa: PTH110
+    existing = next(parent for parent in (path, *path.parents) if os.path.exists(parent))  # noqa: PTH110
     status, name = existing.stat(), "" if existing == path else f"{existing}: "
     owned = f"{name}mode {stat.S_IMODE(status.st_mode):04o}, owner uid {status.st_uid}"
     fix = "As the owner, change the permissions with chmod; or run this command as a user who has access"

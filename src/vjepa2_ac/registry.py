@@ -54,8 +54,8 @@ class Registry:
             path = getattr(thing, "__qualname__", "")  # instances have neither a qualified name nor a module
             origin = f"{getattr(thing, '__module__', caller) if path else caller}:{path}"
             if self._origins.setdefault(name, origin) != origin:
-                found = f"already registered by {_module(self._origins[name])}"
-                raise InputError(where=f"{self.kind} {name!r}", found=found, fix="Choose another name")
+                problem = f"already registered by {_module(self._origins[name])}"
+                raise InputError(where=f"{self.kind} {name!r}", found=problem, fix="Choose another name")
             _registered.append(_package(origin))
             self._things[name] = thing
             return thing
@@ -64,7 +64,7 @@ class Registry:
 
     def names(self) -> list[str]:
         """Return all names, built-in names first. Nothing is imported."""
-        return list(dict.fromkeys([*self._things, *(one.name for one in installed_entry_points(self.group))]))
+        return list(dict.fromkeys([*self._things, *(entry.name for entry in installed_entry_points(self.group))]))
 
     def require_registered(self, name: str) -> str:
         """Return the name if it is registered.
@@ -78,12 +78,12 @@ class Registry:
             raise ValueError(f"no {self.kind} has this name. {did_you_mean(name, names)}{known}")
         origins = [
             self._origins.get(name),
-            *(one.value for one in installed_entry_points(self.group) if one.name == name),
+            *(entry.value for entry in installed_entry_points(self.group) if entry.name == name),
         ]
         packages = {_package(origin): _module(origin) for origin in origins if origin}
         if len(packages) > 1:
-            found = f"registered by {' and by '.join(packages.values())}"
-            raise InputError(where=f"{self.kind} {name!r}", found=found, fix="Rename or uninstall all but one")
+            problem = f"registered by {' and by '.join(packages.values())}"
+            raise InputError(where=f"{self.kind} {name!r}", found=problem, fix="Rename or uninstall all but one")
         return name
 
     def find(self, name: str) -> Any:
@@ -94,7 +94,7 @@ class Registry:
         """
         thing = self._things.get(self.require_registered(name))
         if thing is None:
-            thing = load_entry_point(next(one for one in installed_entry_points(self.group) if one.name == name))
+            thing = load_entry_point(next(entry for entry in installed_entry_points(self.group) if entry.name == name))
         elif isinstance(thing, str):
             module, _, attribute = thing.partition(":")
             thing = getattr(import_module(module), attribute)
@@ -167,14 +167,14 @@ class Registry:
 def _located(error: ValidationError, section: type[BaseModel], at: tuple[str, ...]) -> ValidationError:
     """Return the errors of options with their location in the config; for unknown options with a suggestion."""
     lines = []
-    for one in error.errors(include_url=False):
-        kind, text, location = one["type"], one["msg"], one["loc"]
+    for detail in error.errors(include_url=False):
+        kind, text, location = detail["type"], detail["msg"], detail["loc"]
         if kind == "extra_forbidden":
             known = f"known here: {', '.join(section.model_fields)}"
             suggestion = did_you_mean(str(location[-1]), section.model_fields)
             kind, text = UNKNOWN_OPTION, f"unknown key; {f'd{suggestion[1:-1]}' if suggestion else known}"
         custom = PydanticCustomError(kind, text)
-        lines.append(InitErrorDetails(type=custom, loc=(*at, *location), input=one["input"]))
+        lines.append(InitErrorDetails(type=custom, loc=(*at, *location), input=detail["input"]))
     return ValidationError.from_exception_data(error.title, lines)
 
 
@@ -218,7 +218,7 @@ PLANNING_FILES = Registry(
     "",  # no entry points
     {"prior": "policies.action_prior:load_prior_for_planning", "monitor": "policies.monitor:load_monitor_for_planning"},
 )
-"""Readers of the files that `planning` keys refer to; they are in packages outside of the core."""
+"""Functions that read the files of `planning` keys; they are in packages outside of the core."""
 TRAINING_HOOKS = Registry(
     "training hook",
     "",  # no entry points
@@ -321,11 +321,11 @@ def _mentions_this_package(spec: ModuleSpec) -> bool:
 
 
 def _refuse(module: str, where: str) -> NoReturn:
-    found, needed = (
+    problem, needed = (
         f"plugin {module!r} registers nothing",
         "a module that registers a loss, a planner or another object",
     )
-    raise InputError(where=where, found=found, needed=needed, fix="See docs/extending.md for examples")
+    raise InputError(where=where, found=problem, needed=needed, fix="See docs/extending.md for examples")
 
 
 @contextlib.contextmanager

@@ -139,7 +139,7 @@ def test_a_start_that_another_one_overtook_leaves_its_run_alone(make_config, rep
         return run
 
     monkeypatch.setattr(loop, "restore", overtaken)
-    with pytest.raises(InputError, match="step 6 from another start; this one is at step 0"):
+    with pytest.raises(InputError, match="step 6 from another start; this start is at step 0"):
         train(config, reporter)
     assert newest_checkpoint(Path(config.run_dir) / "checkpoints").name == "step-00000006"
 

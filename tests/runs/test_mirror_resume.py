@@ -346,7 +346,7 @@ def die_in_upload(config: object, reporter, monkeypatch: pytest.MonkeyPatch, *, 
 
     with monkeypatch.context() as dying:
         dying.setattr(storage, "upload", upload)
-        dying.setattr(Mirror, "_begin", Mirror._send)  # at once, and its death is everybody's
+        dying.setattr(Mirror, "_start_pass", Mirror._run_pass)  # in the thread of the run, so that its end ends the run
         with pytest.raises(KilledError):
             train(config, reporter)
     assert len(sent) == before_file

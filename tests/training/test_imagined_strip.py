@@ -52,8 +52,8 @@ def test_a_run_with_strips_equals_the_one_without_bit_for_bit(
 def test_the_clip_is_the_one_with_the_most_motion_and_its_rows_are_true(make_config, reporter, decoder) -> None:
     run = set_up(make_config(validation__decoder=decoder), reporter)
     validate(run, reporter)
-    assert run.strip is not None
-    found = run.strip.rollout(run.world_model, run.accelerator.device, "run")
+    assert run.image_strip is not None
+    found = run.image_strip.rollout(run.world_model, run.accelerator.device, "run")
     windows = validation_windows(run.dataset, "validation", clips=4)
     moved = {}
     for episode, start in windows:

@@ -19,7 +19,7 @@ def of(config: object) -> dict[str, str]:
 
 def test_best_checkpoint_is_discarded_if_the_validation_has_changed(make_config, reporter, monkeypatch) -> None:
     errors = iter([0.9, 0.2, 0.3, 0.8, 0.6])  # the first is the base's
-    monkeypatch.setattr(validation, "validation_metrics", lambda _: {validation.BEST_BY: next(errors)})
+    monkeypatch.setattr(validation, "validation_metrics", lambda _: {validation.SELECTION_ERROR: next(errors)})
     every = {"validation__every": 1, "checkpoint__every": 1, "training__steps": 2, "checkpoint__keep_best": "error"}
     folder = train(make_config(**every), reporter) / "checkpoints"
     assert read_state(newest_checkpoint(folder)).best_error == 0.2

@@ -59,7 +59,7 @@ class Counting(TorchDispatchMode):
         made = func(*args, **(kwargs or {}))
         for leaf in tree_leaves(made):
             if isinstance(leaf, Tensor):
-                self.storages.hold(leaf)
+                self.storages.count(leaf)
         return made
 
 

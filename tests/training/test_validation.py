@@ -33,7 +33,7 @@ def ranks_are(monkeypatch):
 
         def metrics(_: object) -> dict[str, float]:
             error, rank = next(values)
-            return {validation.BEST_BY: error, validation.RANK: rank}
+            return {validation.SELECTION_ERROR: error, validation.RANKING_ERROR: rank}
 
         monkeypatch.setattr(validation, "validation_metrics", metrics)
 

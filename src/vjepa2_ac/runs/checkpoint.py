@@ -34,7 +34,7 @@ STATE = "state.json"
 MANIFEST = "manifest.json"
 ADAPTER = "adapter"  # subfolder, written by `model.adapter_folder.save_trained`
 OPTIMIZER = "optimizer.pt"
-FETCHING = ".fetching-"  # prefix of a checkpoint that is being downloaded, see `runs.mirror`
+FETCHING = ".fetching-"  # prefix of a checkpoint that is being downloaded, see `runs.open_run`
 
 _WRITING = ".writing-"
 SELECTED, NEWEST, BEST = "selected", "newest", "best"
@@ -81,9 +81,7 @@ class RunState:
     best_ranking_error: Finite | None = None  # action-ranking error of the best validation, with keep_best=ranking
     lowest_ranking_error: Finite | None = None  # lowest action-ranking error of all validations
     base_ranking_error: Finite | None = None  # action-ranking error before the first step, with keep_best=ranking
-    validation_settings: Mapping[str, str] | None = (
-        None  # settings on which validation errors depend, see `training.resume`
-    )
+    validation_settings: Mapping[str, str] | None = None  # which determine its errors, see `training.resume`
     loss_scale: Mapping[str, int | float] | None = None  # state of the gradient scaler, with fp16
     data: tuple[DataState, ...] = ()  # the data set and, if configured, the replay data set
 
@@ -146,9 +144,9 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 def remove_incomplete(folder: Path) -> None:
     """Remove incomplete checkpoints left by killed processes. No other process may write into the folder."""
-    for beginning in (_WRITING, FETCHING):
-        for path in folder.glob(f"{beginning}*"):
-            if parse_step(path.name.removeprefix(beginning)) is not None:
+    for prefix in (_WRITING, FETCHING):
+        for path in folder.glob(f"{prefix}*"):
+            if parse_step(path.name.removeprefix(prefix)) is not None:
                 shutil.rmtree(path, ignore_errors=True)
 
 
@@ -168,12 +166,10 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
     """
     final = folder / checkpoint_name(state.step)
     temporary = folder / f"{_WRITING}{final.name}"
-    damaged = [
-        path for path in list_checkpoints(folder) if (parse_step(path.name) or 0) >= state.step
-    ]  # skipped at the start
-    if complete := [path for path in damaged if find_damage(path) is None]:
-        found = "a complete checkpoint of another process, which is not overwritten"
-        raise InputError(where=str(complete[0]), found=found, fix="Run the same command again to resume from it")
+    later = [path for path in list_checkpoints(folder) if (parse_step(path.name) or 0) >= state.step]
+    if complete := [path for path in later if find_damage(path) is None]:
+        problem = "a complete checkpoint of another process, which is not overwritten"
+        raise InputError(where=str(complete[0]), found=problem, fix="Run the same command again to resume from it")
     try:
         remove_incomplete(folder)  # frees disk space
         shutil.rmtree(temporary, ignore_errors=True)
@@ -182,7 +178,7 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
         values = {_FILE_KEYS.get(name, name): value for name, value in asdict(state).items()}
         (temporary / STATE).write_text(json.dumps(values))
         write_manifest(temporary)
-        for path in damaged:
+        for path in later:  # all are damaged: the run did not resume from them
             _remove(path)
         temporary.rename(final)
         sync(folder)
@@ -191,9 +187,9 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
                 _remove(old)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
-        found = f"the checkpoint cannot be written ({error.strerror or error})"
+        problem = f"the checkpoint cannot be written ({error.strerror or error})"
         fix = "Older checkpoints are unchanged. Free disk space, then run the same command again to resume"
-        raise InputError(where=str(final), found=found, fix=fix) from error
+        raise InputError(where=str(final), found=problem, fix=fix) from error
     return final
 
 
@@ -343,10 +339,10 @@ def read_torch(path: Path) -> Any:
         except Exception as error:  # torch raises errors of any type for a damaged file
             if is_os_read_error(error):
                 raise
-            found = f"cannot be read ({error})"
+            problem = f"cannot be read ({error})"
             if isinstance(error, pickle.UnpicklingError):
-                found = "objects other than tensors and plain values, which could execute code"
-            raise InputError(where=str(path), found=found, needed=needed) from None
+                problem = "objects other than tensors and plain values, which could execute code"
+            raise InputError(where=str(path), found=problem, needed=needed) from None
 
 
 def _require_as_written(path: Path) -> None:
@@ -363,16 +359,17 @@ def _require_as_written(path: Path) -> None:
 
 # ---- selection ----
 
-_FORMER_REASONS = {  # text in files written before 2026-12-01 -> the text for the same selection now
-    "the newest: none was selected": "the newest, none was selected by validation",
-    "as asked for": "as requested",
-}
+_NOT_SELECTED = "the newest, none was selected by validation"
+_REQUESTED = "as requested"
 
 
 def selection_reason(description: str) -> str:
     """Return how a checkpoint was selected, from its description in a file: str(SelectedCheckpoint), of any version."""
     reason = description.partition(" (")[2].removesuffix(")")
-    return _FORMER_REASONS.get(reason, reason)
+    # Before 2026-12-01 these two reasons were described in other words.
+    if reason.startswith("as "):
+        return _REQUESTED
+    return _NOT_SELECTED if "none was selected" in reason else reason
 
 
 @dataclass(frozen=True)
@@ -380,21 +377,21 @@ class SelectedCheckpoint:
     """A complete checkpoint, and how it was selected."""
 
     path: Path
-    why: str  # how it was selected, as text
-    by: str  # the argument `by` of `select_checkpoint`
+    reason: str  # how it was selected, as text
+    selection: str  # the argument of `select_checkpoint`
     newest: RunState  # progress of the run at its newest checkpoint
 
     def __str__(self) -> str:
         """Return the folder name, and how the checkpoint was selected."""
-        return f"{self.path.name} ({self.why})"
+        return f"{self.path.name} ({self.reason})"
 
 
-def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
+def select_checkpoint(run: Path, selection: str = SELECTED) -> SelectedCheckpoint:
     """Select a complete checkpoint of a run.
 
     Args:
         run: The run folder.
-        by: selected (the best if there is one, otherwise the newest), newest, best (by validation, see
+        selection: selected (the best if there is one, otherwise the newest), newest, best (by validation, see
             `checkpoint.keep_best`), or a number of optimizer steps.
 
     Raises:
@@ -406,16 +403,16 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
         fix = f"Resume training with `{shell_command('train', run, '--resume')}`"
         raise InputError(where=str(run), found="a run without a complete checkpoint", needed="at least one", fix=fix)
     state = read_written_state(newest)
-    if by == NEWEST or (by == SELECTED and state.best_step is None):
-        why = "the newest" if by == NEWEST else "the newest, none was selected by validation"
-        return SelectedCheckpoint(newest, why, by, state)
-    is_best = by in {SELECTED, BEST}
-    step = state.best_step if is_best else parse_step(f"step-{by.zfill(8)}")
+    if selection == NEWEST or (selection == SELECTED and state.best_step is None):
+        reason = "the newest" if selection == NEWEST else _NOT_SELECTED
+        return SelectedCheckpoint(newest, reason, selection, state)
+    is_best = selection in {SELECTED, BEST}
+    step = state.best_step if is_best else parse_step(f"step-{selection.zfill(8)}")
     path = folder / checkpoint_name(step or 0)
     problem: str | None
     if step is None:
-        why = "no validation yet, a changed validation, checkpoint.keep_best was off, or it was deleted"
-        problem = f"no best checkpoint ({why})" if is_best else f"--checkpoint {by}"
+        causes = "no validation yet, a changed validation, checkpoint.keep_best was off, or it was deleted"
+        problem = f"no best checkpoint ({causes})" if is_best else f"--checkpoint {selection}"
     elif not path.is_dir():
         problem = f"no checkpoint of step {step:,}"
     else:
@@ -424,4 +421,5 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
         steps = ", ".join(str(parse_step(path.name)) for path in list_checkpoints(folder) if find_damage(path) is None)
         raise InputError(where=str(folder), found=problem, needed=f"selected, newest, best or one of the steps {steps}")
     measure = "error" if state.best_ranking_error is None else "action ranking"
-    return SelectedCheckpoint(path, f"the best by {measure}" if is_best else "as requested", by, state)
+    reason = f"the best by {measure}" if is_best else _REQUESTED
+    return SelectedCheckpoint(path, reason, selection, state)

@@ -62,16 +62,13 @@ METRICS = "metrics.jsonl"
 TENSORBOARD = "tensorboard"
 SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS)  # needed to resume on another machine
 _ID = re.compile(r"[\w.-]{0,128}")
-_MOST_BYTES_OF_ID = 1_000
+_MAX_ID_BYTES = 1_000
 IMAGINED = "imagined"
 
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS})
-_OF_DATA = ("path", "idle.ranges", "cache_dir", "disk_cache.dir")
-MOVABLE_PATHS = (
-    "model.base",
-    "model.encoder.path",
-)  # paths that may change: the weights are identified by a fingerprint
-_PATHS = (*(f"{data}.{key}" for data in ("data", "replay.data") for key in _OF_DATA), *MOVABLE_PATHS)
+_DATA_PATHS = ("path", "idle.ranges", "cache_dir", "disk_cache.dir")
+MOVABLE_PATHS = ("model.base", "model.encoder.path")  # may change, because a fingerprint identifies the weights
+_PATHS = (*(f"{data}.{key}" for data in ("data", "replay.data") for key in _DATA_PATHS), *MOVABLE_PATHS)
 
 
 def check_run_folder(config: Config, *, allow_config_change: bool = False) -> None:
@@ -91,14 +88,16 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
     if (folder / CONFIG).exists():
         changed = [] if allow_config_change else changed_keys(read_run_config(folder), config)
         if differing := [key for key in changed if Affects.RUN in get_effect(key, Config)]:
-            found = f"a run with another config; it differs in {', '.join(differing)}"
-            same = f"Set another run_dir for a new run, or resume with `{shell_command('train', folder, '--resume')}`"
-            fix = f"{same}. To resume with the changed config, add --allow-config-change"
-            raise InputError(where=str(folder), found=found, needed="the same config, to resume the run", fix=fix)
+            problem = f"a run with another config; it differs in {', '.join(differing)}"
+            options = (
+                f"Set another run_dir for a new run, or resume with `{shell_command('train', folder, '--resume')}`"
+            )
+            fix = f"{options}. To resume with the changed config, add --allow-config-change"
+            raise InputError(where=str(folder), found=problem, needed="the same config, to resume the run", fix=fix)
     elif folder.exists() and not all(_is_without_config(path) for path in folder.iterdir()):
-        found = "a folder with other files and without config.yaml"
+        problem = "a folder with other files and without config.yaml"
         needed = "a new or empty folder, or the folder of a run"
-        raise InputError(where=str(folder), found=found, needed=needed, fix="Set another run_dir")
+        raise InputError(where=str(folder), found=problem, needed=needed, fix="Set another run_dir")
     with translate_write_errors(folder):
         check_local_writable(folder)
 
@@ -137,7 +136,7 @@ def run_id(folder: Path) -> str:
     path = folder / RUN_ID
     if not path.is_file():
         return secrets.token_hex(8)
-    name = read_small_file(path, _MOST_BYTES_OF_ID).decode(errors="replace").strip()
+    name = read_small_file(path, _MAX_ID_BYTES).decode(errors="replace").strip()
     if not _ID.fullmatch(name):
         raise InputError(where=str(path), found=short_repr(name), needed="the name of a run: letters, digits and . _ -")
     return name
@@ -194,9 +193,9 @@ def read_run_config(folder: Path, overrides: Iterable[str] = ()) -> Config:
         InputError: The folder is no run folder, or an override is wrong.
     """
     if not (folder / CONFIG).is_file():
-        found = "no config.yaml" if folder.is_dir() else "no such folder"
+        problem = "no config.yaml" if folder.is_dir() else "no such folder"
         needed = "the folder of a run, which `vjepa2-ac train CONFIG` creates"
-        raise InputError(where=str(folder), found=found, needed=needed)
+        raise InputError(where=str(folder), found=problem, needed=needed)
     overrides = [*overrides, f"run_dir={json.dumps(to_config_value(folder))}"]
     config = load_config_of_run(folder / CONFIG, overrides)
     moved = [f"{key}={json.dumps(path)}" for key, path in _seen_from_start(config, folder)]
@@ -270,11 +269,11 @@ def with_values_of_run(config: Config) -> Config:
     run = read_run_config(folder)
     if config.data.stride == "auto" and run.data.stride != "auto":
         config = config.with_stride(run.data.stride)
-    data, *others = [
-        one if "splits" in one.model_fields_set else one.model_copy(update={"splits": before.splits})
-        for one, before in zip(config.data_sets, [*run.data_sets, run.data], strict=False)
+    data, *replay_data = [
+        section if "splits" in section.model_fields_set else section.model_copy(update={"splits": before.splits})
+        for section, before in zip(config.data_sets, [*run.data_sets, run.data], strict=False)
     ]
-    replay = config.replay and config.replay.model_copy(update={"data": others[0]})
+    replay = config.replay and config.replay.model_copy(update={"data": replay_data[0]})
     return config.model_copy(update={"data": data, "replay": replay})
 
 
@@ -306,10 +305,10 @@ class RunLock:
             try:
                 self._lock.acquire(blocking=False)
             except Timeout:
-                found = f"a run that is in use by {describe_last_start(self._folder / ENVIRONMENT)}"
+                problem = f"a run that is in use by {describe_last_start(self._folder / ENVIRONMENT)}"
                 needed = "a folder that no other process writes to"
                 fix = "Wait until that process exits, stop it, or set another run_dir"
-                raise InputError(where=str(self._folder), found=found, needed=needed, fix=fix) from None
+                raise InputError(where=str(self._folder), found=problem, needed=needed, fix=fix) from None
             except OSError as error:
                 if error.errno not in _NO_LOCKS:
                     raise

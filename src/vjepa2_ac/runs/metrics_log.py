@@ -39,7 +39,7 @@ logger = logging.getLogger(__name__)
 WARNING = "warning"  # kind of a row in metrics.jsonl with a `text` instead of metrics
 STALLED_S = 60.0
 
-_MOST_BYTES = 1 << 28
+_MAX_BYTES = 1 << 28
 
 Image = UInt8[np.ndarray, "height width 3"]
 
@@ -58,9 +58,9 @@ class MetricsLog:
 
     def __init__(self, run_dir: Path, *, first_step: int, trackers: Trackers | None = None) -> None:
         self.path = run_dir / METRICS
-        kept = [row for row in read_metrics_log(self.path) if row["step"] <= first_step] if first_step > 0 else []
+        rows = [row for row in read_metrics_log(self.path) if row["step"] <= first_step] if first_step > 0 else []
         with translate_write_errors(self.path):
-            write_atomically(self.path, "".join(json.dumps(row) + "\n" for row in kept).encode())
+            write_atomically(self.path, "".join(json.dumps(row) + "\n" for row in rows).encode())
             self._handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
         self._waiting = b""  # rows that could not be written yet; the first may be partly written
         self._trackers = trackers or Trackers({})
@@ -97,9 +97,9 @@ class MetricsLog:
         if error and self._waiting:
             error = self._write(sync=True)
         if error:  # after a failed fsync the system may have discarded the data
-            found = f"the latest metrics cannot be written ({error.strerror or error}), and are lost"
+            problem = f"the latest metrics cannot be written ({error.strerror or error}), and are lost"
             fix = "Free disk space, then run the same command again to resume"
-            raise InputError(where=str(self.path), found=found, fix=f"The checkpoint of this step is saved. {fix}")
+            raise InputError(where=str(self.path), found=problem, fix=f"The checkpoint of this step is saved. {fix}")
 
     def _write(self, *, sync: bool = False) -> OSError | None:
         """Write the waiting rows, and with `sync` flush them to the disk; return the error if this fails."""
@@ -134,7 +134,7 @@ def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
     """
     if not path.exists():
         return
-    for line in read_small_file(path, _MOST_BYTES).decode(errors="replace").splitlines():
+    for line in read_small_file(path, _MAX_BYTES).decode(errors="replace").splitlines():
         try:
             row = parse_json_object(line, where=str(path))
         except InputError:
@@ -231,8 +231,8 @@ def require_installed(tracking: TrackingConfig) -> None:
     }
     for library, (is_requested, install, off) in requested.items():
         if is_requested and importlib.util.find_spec(library) is None:
-            found, fix = f"enabled, but {library} is not installed", f"Run {install}, or set tracking.{library}={off}"
-            raise InputError(where=f"tracking.{library}", found=found, fix=fix)
+            problem, fix = f"enabled, but {library} is not installed", f"Run {install}, or set tracking.{library}={off}"
+            raise InputError(where=f"tracking.{library}", found=problem, fix=fix)
 
 
 def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int) -> Trackers:
@@ -258,8 +258,8 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
         openings["Weights & Biases"] = lambda: _wandb(config, folder, run_id)
     if tracking.trackio:
         openings["trackio"] = lambda: _trackio(config, run_id)
-    for name, given in tracking.others.items():
-        openings[name] = partial(TRACKERS.find(name), folder, run_id, **TRACKERS.options(name, given))
+    for name, options in tracking.others.items():
+        openings[name] = partial(TRACKERS.find(name), folder, run_id, **TRACKERS.options(name, options))
     return Trackers(openings)
 
 

@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 UPLOADING = ".sending.json"  # name of the manifest during an upload
 REMOTE_KEY = "checkpoint.remote"
 LONGEST_WAIT_S = 3600.0  # for the uploads at the end of a run
-_LOOK_EVERY_S = 0.1  # interval of checks whether the machine is about to stop
+_POLL_INTERVAL_S = 0.1  # interval of checks whether the machine is about to stop
 
 Listing = Mapping[str, Mapping[str, int]]
 """Name of the checkpoint -> file name -> size in bytes."""
@@ -69,15 +69,15 @@ class RemoteCheckpoints:
     """The checkpoints in a remote folder; every method raises UnreachableError if it cannot be reached.
 
     Attributes:
-        place: The URL or path of the remote folder, from `storage.canonical_path`.
+        location: The URL or path of the remote folder, from `storage.canonical_path`.
     """
 
-    place: str
+    location: str
 
     def list_files(self) -> Listing:
         """List all remote checkpoints, complete or not, with one request."""
         checkpoints: dict[str, dict[str, int]] = {}
-        for path, size in storage.file_sizes(storage.join(self.place, CHECKPOINTS)).items():
+        for path, size in storage.file_sizes(storage.join(self.location, CHECKPOINTS)).items():
             name, _, file = path.partition("/")
             if parse_step(name) is not None and file:
                 checkpoints.setdefault(name, {})[file] = size
@@ -87,7 +87,7 @@ class RemoteCheckpoints:
         """Return the id of the run to which all checkpoints in a listing belong; None if it is not known.
 
         Args:
-            listing: The result of `listing`; incomplete checkpoints count, too.
+            listing: The result of `list_files`; incomplete checkpoints count, too.
             run_id: The expected run; None for any run.
 
         Raises:
@@ -100,10 +100,10 @@ class RemoteCheckpoints:
                 continue
             run_id = owner if run_id is None else run_id
             if owner != run_id:
-                found = f"{self.place} contains a checkpoint of another run, {name}"
+                problem = f"{self.location} contains a checkpoint of another run, {name}"
                 fix = "Set another checkpoint.remote; nothing was written to this folder"
                 raise RemoteFolderTakenError(
-                    where=REMOTE_KEY, found=found, needed="an empty folder, or that of this run", fix=fix
+                    where=REMOTE_KEY, found=problem, needed="an empty folder, or that of this run", fix=fix
                 )
         return run_id
 
@@ -127,10 +127,8 @@ class RemoteCheckpoints:
         if missing and UPLOADING not in files:
             storage.upload(checkpoint / MANIFEST, self._path(name, UPLOADING))
         manifest_last = [MANIFEST] if missing or MANIFEST not in files else []
-        for path in [
-            *sorted(missing, key=lambda path: path != STATE),
-            *manifest_last,
-        ]:  # first the file with the run id
+        state_first = sorted(missing, key=lambda path: path != STATE)  # it contains the run id
+        for path in (*state_first, *manifest_last):
             before_each()
             storage.upload(checkpoint / path, self._path(name, path))
         if missing or UPLOADING in files:
@@ -157,7 +155,7 @@ class RemoteCheckpoints:
         return find_damage(folder)
 
     def _path(self, *names: str) -> str:
-        return storage.join(self.place, "/".join((CHECKPOINTS, *names)))
+        return storage.join(self.location, "/".join((CHECKPOINTS, *names)))
 
 
 class Mirror:
@@ -168,19 +166,21 @@ class Mirror:
     first.
 
     Args:
-        place: The value of `checkpoint.remote`.
+        location: The value of `checkpoint.remote`.
         config: The config of the run.
         run_id: The id of the run. Checkpoints of other runs are an error.
     """
 
-    def __init__(self, place: str, config: Config, run_id: str) -> None:
-        self._remote, self._run_id = RemoteCheckpoints(storage.canonical_path(place)), run_id
+    def __init__(self, location: str, config: Config, run_id: str) -> None:
+        self._remote, self._run_id = RemoteCheckpoints(storage.canonical_path(location)), run_id
         self._folder, self._config = Path(config.run_dir), config.checkpoint
         self._thread: threading.Thread | None = None
-        self._begun_s = -float("inf")
-        self._aim: str | None = None  # the newest local checkpoint when the thread started
-        self._sent: str | None = None  # the newest remote checkpoint
-        self._starts: bytes | None = None  # the uploaded list of starts; another remote list means a later start
+        self._started_s = -float("inf")
+        self._target: str | None = None  # the newest local checkpoint when the thread started
+        self._newest_uploaded: str | None = None  # the newest remote checkpoint
+        self._uploaded_starts: bytes | None = (
+            None  # the uploaded list of starts; another remote list means a later start
+        )
         self._outage_reported = self._is_lost = self._is_ending = self._has_ended = False
         shutil.rmtree(self._folder / UPLOAD_LINKS, ignore_errors=True)  # links of a killed process
 
@@ -189,44 +189,42 @@ class Mirror:
 
         The first checkpoint after a start is uploaded immediately.
         """
-        is_due = time.monotonic() - self._begun_s >= 60.0 * self._config.remote_every_minutes
-        if is_due and not self.is_uploading and self._newest_here() != self._sent:
-            self._begin()
+        is_due = time.monotonic() - self._started_s >= 60.0 * self._config.remote_every_minutes
+        if is_due and not self.is_uploading and self._newest_local() != self._newest_uploaded:
+            self._start_pass()
 
     @property
     def is_uploading(self) -> bool:
         """Whether an upload pass is in progress."""
         return self._thread is not None and self._thread.is_alive()
 
-    def finish(self, is_asked_to_stop: Callable[[], bool]) -> None:
+    def finish(self, is_stopping: Callable[[], bool]) -> None:
         """Upload the newest files and wait for the upload; warn if the remote copy is not up to date afterwards.
 
         Args:
-            is_asked_to_stop: Returns whether the machine is about to stop. The wait is limited to
+            is_stopping: Returns whether the machine is about to stop. The wait is limited to
                 `checkpoint.remote_wait_seconds` in this case, otherwise to an hour.
         """
         if self._has_ended:
             return
         self._is_ending = True
-        begun_s, limit_s = time.monotonic(), LONGEST_WAIT_S
+        started_s, limit_s = time.monotonic(), LONGEST_WAIT_S
         for is_last in (False, True):  # the current pass ends, or is cancelled if there is a newer checkpoint
             if is_last and not self.is_uploading:
-                self._begin()
-            while self._thread and self.is_uploading and time.monotonic() < begun_s + limit_s:
-                if limit_s == LONGEST_WAIT_S and is_asked_to_stop():
-                    limit_s = time.monotonic() - begun_s + self._config.remote_wait_seconds
-                self._thread.join(_LOOK_EVERY_S)
+                self._start_pass()
+            while self._thread and self.is_uploading and time.monotonic() < started_s + limit_s:
+                if limit_s == LONGEST_WAIT_S and is_stopping():
+                    limit_s = time.monotonic() - started_s + self._config.remote_wait_seconds
+                self._thread.join(_POLL_INTERVAL_S)
         in_time, self._has_ended = not self.is_uploading, True
-        if not self._is_lost and not (in_time and self._sent == self._newest_here()):
+        if not self._is_lost and not (in_time and self._newest_uploaded == self._newest_local()):
             text = (
                 "%s contains checkpoints up to %s. Later ones in %s are only on this machine%s. The next start uploads"
             )
             text += " them"
-            sent, late = (
-                self._sent or "those of earlier starts",
-                "" if in_time else ", because the time for uploads was over",
-            )
-            logger.warning(text, self._remote.place, sent, self._folder / CHECKPOINTS, late)
+            newest = self._newest_uploaded or "those of earlier starts"
+            reason = "" if in_time else ", because the time for uploads was over"
+            logger.warning(text, self._remote.location, newest, self._folder / CHECKPOINTS, reason)
 
     def __enter__(self) -> Mirror:
         return self
@@ -236,16 +234,16 @@ class Mirror:
             self.finish(lambda: True)
         self._has_ended = True
 
-    def _begin(self) -> None:
-        self._begun_s, self._aim = time.monotonic(), self._newest_here()
+    def _start_pass(self) -> None:
+        self._started_s, self._target = time.monotonic(), self._newest_local()
         if not self._is_lost:
-            self._thread = threading.Thread(target=self._send, name="mirror", daemon=True)
+            self._thread = threading.Thread(target=self._run_pass, name="mirror", daemon=True)
             self._thread.start()
 
-    def _send(self) -> None:
+    def _run_pass(self) -> None:
         try:
             with suppress_retry_warnings():
-                self._bring_up_to_date()
+                self._upload_pass()
             self._outage_reported = False
         except _CancelledError:
             pass
@@ -258,16 +256,16 @@ class Mirror:
             log(text, REMOTE_KEY, describe_upload_error(error), self._config.remote_every_minutes)
             self._outage_reported = True
         except Exception:  # no error here may stop the run
-            logger.exception("%s: %s is not up to date; training continues", REMOTE_KEY, self._remote.place)
+            logger.exception("%s: %s is not up to date; training continues", REMOTE_KEY, self._remote.location)
         finally:
             shutil.rmtree(self._folder / UPLOAD_LINKS, ignore_errors=True)
 
-    def _continue_pass(self) -> None:
+    def _cancel_if_outdated(self) -> None:
         """Cancel the upload pass if the mirror has ended, or is finishing and there is a newer checkpoint."""
-        if self._has_ended or (self._is_ending and self._newest_here() != self._aim):
+        if self._has_ended or (self._is_ending and self._newest_local() != self._target):
             raise _CancelledError
 
-    def _bring_up_to_date(self) -> None:
+    def _upload_pass(self) -> None:
         """Upload missing files: the small files of the run, the newest complete checkpoint, and the best one.
 
         Incomplete older checkpoints are removed before the upload, to free space. Complete ones beyond
@@ -281,42 +279,42 @@ class Mirror:
         remote = self._remote
         listing = remote.list_files()
         remote.find_owner(listing, self._run_id)
-        path = storage.join(remote.place, ENVIRONMENT)
+        path = storage.join(remote.location, ENVIRONMENT)
         with suppress(FileNotFoundError):  # two uploaders would overwrite each other's files
-            if self._starts is not None and storage.read_small_file(path, MAX_BYTES) != self._starts:
-                found = f"{remote.place} is used by a later start of this run, {describe_last_start(path)}"
+            if self._uploaded_starts is not None and storage.read_small_file(path, MAX_BYTES) != self._uploaded_starts:
+                problem = f"{remote.location} is used by a later start of this run, {describe_last_start(path)}"
                 fix = "This start continues without uploads. Stop one of the two"
-                raise RemoteFolderTakenError(where=REMOTE_KEY, found=found, fix=fix)
+                raise RemoteFolderTakenError(where=REMOTE_KEY, found=problem, fix=fix)
         names = [path.name for path in reversed(list_checkpoints(self._folder / CHECKPOINTS))]
-        newest = next(filter(None, map(self._hold, names)), None)
+        newest = next(filter(None, map(self._link_files, names)), None)
         if newest is None:
             return
         best = read_written_state(newest).best_name
         for name in sorted(listing.keys() - {*list_complete(listing), newest.name, best}):
             if step_number(name) < step_number(newest.name):
-                self._continue_pass()
+                self._cancel_if_outdated()
                 remote.remove(name)
-        self._send_small_files()
-        for checkpoint in (newest, self._hold(best) if best and best != newest.name else None):
+        self._upload_small_files()
+        for checkpoint in (newest, self._link_files(best) if best and best != newest.name else None):
             if checkpoint is not None:
-                remote.upload(checkpoint, listing.get(checkpoint.name, {}), self._continue_pass)
+                remote.upload(checkpoint, listing.get(checkpoint.name, {}), self._cancel_if_outdated)
         for name in sorted({*list_complete(remote.list_files())[self._config.keep :]} - {newest.name, best}):
-            self._continue_pass()
+            self._cancel_if_outdated()
             remote.remove(name)
-        self._sent = newest.name
+        self._newest_uploaded = newest.name
 
-    def _send_small_files(self) -> None:
+    def _upload_small_files(self) -> None:
         """Upload copies of the small files, because they may grow during the upload."""
         for name in SMALL_FILES:
             source, copy = self._folder / name, self._folder / UPLOAD_LINKS / name
             if source.is_file():
-                self._continue_pass()
+                self._cancel_if_outdated()
                 shutil.copyfile(source, copy)
-                storage.upload(copy, storage.join(self._remote.place, name))
+                storage.upload(copy, storage.join(self._remote.location, name))
                 if name == ENVIRONMENT:
-                    self._starts = copy.read_bytes()
+                    self._uploaded_starts = copy.read_bytes()
 
-    def _hold(self, name: str) -> Path | None:
+    def _link_files(self, name: str) -> Path | None:
         """Link the files of a checkpoint into a folder of the mirror, so that training may remove it during the upload.
 
         Returns None if the checkpoint is incomplete or is being removed.
@@ -324,20 +322,20 @@ class Mirror:
         Raises:
             OSError: A complete checkpoint cannot be read.
         """
-        source, held = self._folder / CHECKPOINTS / name, self._folder / UPLOAD_LINKS / name
-        shutil.rmtree(held, ignore_errors=True)
+        source, links = self._folder / CHECKPOINTS / name, self._folder / UPLOAD_LINKS / name
+        shutil.rmtree(links, ignore_errors=True)
         try:
             for file in (MANIFEST, *parse_manifest(storage.read_small_file(source / MANIFEST, MAX_BYTES))):
-                (held / file).parent.mkdir(parents=True, exist_ok=True)
+                (links / file).parent.mkdir(parents=True, exist_ok=True)
                 try:
-                    os.link(source / file, held / file)
+                    os.link(source / file, links / file)
                 except OSError:  # a file system without hard links
-                    shutil.copyfile(source / file, held / file)
+                    shutil.copyfile(source / file, links / file)
         except (FileNotFoundError, InputError):
             return None
-        return held
+        return links
 
-    def _newest_here(self) -> str | None:
+    def _newest_local(self) -> str | None:
         return next((path.name for path in reversed(list_checkpoints(self._folder / CHECKPOINTS))), None)
 
 

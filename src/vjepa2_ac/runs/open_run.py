@@ -59,20 +59,18 @@ class OpenRun:
                 `open_run_folder`.
         """
         self.lock.take()
-        later = [
-            path for path in list_checkpoints(Path(config.run_dir, CHECKPOINTS)) if step_number(path.name) > state.step
-        ]
+        checkpoints = list_checkpoints(Path(config.run_dir, CHECKPOINTS))
+        later = [path for path in checkpoints if step_number(path.name) > state.step]
         if newest := next((path for path in reversed(later) if find_damage(path) is None), None):
-            found = (
-                f"a checkpoint of step {step_number(newest.name)} from another start; this one is at step {state.step}"
-            )
-            raise InputError(where=str(newest), found=found, fix="Run the same command again to resume from it")
+            problem = f"a checkpoint of step {step_number(newest.name)} from another start; this start is at step"
+            problem += f" {state.step}"
+            raise InputError(where=str(newest), found=problem, fix="Run the same command again to resume from it")
         open_run_folder(config, state.run_id, allow_config_change=self.allow_config_change)
 
     def mirror(self, run_id: str) -> Mirror | None:
         """Return the mirror that keeps `checkpoint.remote` up to date; None if that is not set."""
-        place = self.config.checkpoint.remote
-        return None if place is None else Mirror(place, self.config, run_id)
+        location = self.config.checkpoint.remote
+        return None if location is None else Mirror(location, self.config, run_id)
 
 
 @contextlib.contextmanager
@@ -90,17 +88,19 @@ def open_run(
     Raises:
         InputError: The folder belongs to another run, is in use or is not writable; or see `open_remote`.
     """
-    config, trial = with_values_of_run(config), None
+    config, check_folder = with_values_of_run(config), None
     check_run_folder(config, allow_config_change=allow_config_change)
     with contextlib.ExitStack() as exit_stack:
         lock = exit_stack.enter_context(RunLock(Path(config.run_dir)))
         if check_only:
-            trial = Path(exit_stack.enter_context(tempfile.TemporaryDirectory()), "run")
+            check_folder = Path(exit_stack.enter_context(tempfile.TemporaryDirectory()), "run")
         elif Path(config.run_dir).is_dir():  # a new folder is created and locked after all checks
             lock.take()
         # The lock is acquired before a download into the run folder: another process could still be writing there.
-        first = None if check_only else lock
-        config = open_remote(config, reporter, lock=first, allow_config_change=allow_config_change, into=trial)
+        lock_to_take = None if check_only else lock
+        config = open_remote(
+            config, reporter, lock=lock_to_take, allow_config_change=allow_config_change, into=check_folder
+        )
         yield OpenRun(with_values_of_run(config), lock, allow_config_change)
 
 
@@ -136,30 +136,30 @@ def open_remote(
     """
     if config.checkpoint.remote is None:
         return config
-    place, run_dir = storage.canonical_path(config.checkpoint.remote), Path(config.run_dir).resolve()
-    if not storage.is_url(place) and Path(place).is_relative_to(run_dir):
-        found, needed = f"{place}, and run_dir is {run_dir}", "a folder outside run_dir"
+    location, run_dir = storage.canonical_path(config.checkpoint.remote), Path(config.run_dir).resolve()
+    if not storage.is_url(location) and Path(location).is_relative_to(run_dir):
+        problem, needed = f"{location}, and run_dir is {run_dir}", "a folder outside run_dir"
         fix = "Set checkpoint.remote to a folder on another disk, or a URL such as gs://bucket/run"
-        raise InputError(where=REMOTE_KEY, found=found, needed=needed, fix=fix)
+        raise InputError(where=REMOTE_KEY, found=problem, needed=needed, fix=fix)
     state = None
     with suppress(InputError):  # all local checkpoints are damaged, but a remote one may be complete
         newest = newest_checkpoint(run_dir / CHECKPOINTS)
         state = None if newest is None else read_written_state(newest)
-    remote, newer = RemoteCheckpoints(place), list[str]()
+    remote, newer = RemoteCheckpoints(location), list[str]()
     owner: str | None = None
     try:
         with suppress_retry_warnings():
-            storage.check_writable(place)
+            storage.check_writable(location)
             listing = remote.list_files()
             owner = remote.find_owner(listing, None if state is None else state.run_id)
         minutes = config.checkpoint.remote_every_minutes
-        reporter.note(f"{place} is writable. It is updated every {minutes:g} minutes, and at the end of the run.")
+        reporter.note(f"{location} is writable. It is updated every {minutes:g} minutes, and at the end of the run.")
         newer = [name for name in list_complete(listing) if state is None or step_number(name) > state.step]
         if not newer and (state is not None or owner is None):
             return config
         # An owner without a complete checkpoint means that a machine was killed during its first upload.
         target = config if into is None else config.model_copy(update={"run_dir": str(into)})
-        _require_this_config(target, place, allow_config_change=allow_config_change)
+        _require_this_config(target, location, allow_config_change=allow_config_change)
         if lock is not None:
             lock.take()
         is_fetched = _fetch_newest(remote, newer, Path(target.run_dir), reporter, removes_damaged=into is None)
@@ -176,23 +176,25 @@ def open_remote(
         return config
     if is_fetched or state is not None:
         return target if is_fetched else config
-    found = f"{place}: none of {counted(len(newer), 'checkpoint')} is complete"
+    problem = f"{location}: none of {counted(len(newer), 'checkpoint')} is complete"
     fix = "To start the run again from step 0, remove them, or set another checkpoint.remote"
-    raise InputError(where=REMOTE_KEY, found=found, fix=fix)
+    raise InputError(where=REMOTE_KEY, found=problem, fix=fix)
 
 
-def _require_this_config(config: Config, place: str, *, allow_config_change: bool) -> None:
+def _require_this_config(config: Config, location: str, *, allow_config_change: bool) -> None:
     """Refuse a remote run whose config differs, as for a local run folder."""
     with tempfile.TemporaryDirectory() as folder:
         with suppress(FileNotFoundError):
-            storage.download(storage.join(place, CONFIG), Path(folder, CONFIG))
+            storage.download(storage.join(location, CONFIG), Path(folder, CONFIG))
         try:
-            there = with_values_of_run(config.model_copy(update={"run_dir": folder}))
-            check_run_folder(there, allow_config_change=allow_config_change)
+            remote_config = with_values_of_run(config.model_copy(update={"run_dir": folder}))
+            check_run_folder(remote_config, allow_config_change=allow_config_change)
         except InputError as error:
             fix = "Set another checkpoint.remote for a new run. To resume with the changed"
             fix += " config, add --allow-config-change"
-            raise InputError(where=f"{REMOTE_KEY} {place}", found=error.found, needed=error.needed, fix=fix) from None
+            raise InputError(
+                where=f"{REMOTE_KEY} {location}", found=error.found, needed=error.needed, fix=fix
+            ) from None
 
 
 def _fetch_newest(
@@ -204,11 +206,11 @@ def _fetch_newest(
     """
     for name in SMALL_FILES:  # config.yaml first, because it marks a run folder
         with suppress(FileNotFoundError):
-            storage.download(storage.join(remote.place, name), folder / name)
+            storage.download(storage.join(remote.location, name), folder / name)
     remove_incomplete(folder / CHECKPOINTS)
     for number, name in enumerate(names):
         if _fetch(remote, name, folder / CHECKPOINTS):
-            reporter.note(f"Downloaded {name} from {remote.place}.")
+            reporter.note(f"Downloaded {name} from {remote.location}.")
             with suppress(UnreachableError):
                 for damaged in names[:number] if removes_damaged else ():
                     remote.remove(damaged)
@@ -221,7 +223,7 @@ def _fetch(remote: RemoteCheckpoints, name: str, checkpoints: Path) -> bool:
     fetched, final = checkpoints / f"{FETCHING}{name}", checkpoints / name
     if problem := remote.download(name, fetched):
         shutil.rmtree(fetched)
-        logger.warning("%s: %s: %s; skipped", remote.place, name, problem)
+        logger.warning("%s: %s: %s; skipped", remote.location, name, problem)
         return False
     best = read_written_state(fetched).best_name
     if best is not None and best != name and not (checkpoints / best).is_dir():

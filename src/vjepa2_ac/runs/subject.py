@@ -82,8 +82,8 @@ def load_subject(
     name = str(name)
     if not is_run(name):
         if checkpoint != SELECTED:
-            found, needed = f"{name}, which is not the folder of a run", "a run, because a model has no checkpoints"
-            raise InputError(where=f"--checkpoint {checkpoint}", found=found, needed=needed)
+            problem, needed = f"{name}, which is not the folder of a run", "a run, because a model has no checkpoints"
+            raise InputError(where=f"--checkpoint {checkpoint}", found=problem, needed=needed)
         config = config_of_model(name, overrides) if config is None else config
         return Subject(name, config, load_base(config.model.with_base(name), seed=config.seed))
     folder, config = Path(name), config or read_config_of_moved_run(Path(name), overrides)
@@ -91,7 +91,7 @@ def load_subject(
     selected = select_checkpoint(folder, checkpoint)
     world_model = load_base(config.model, seed=config.seed)
     load_trained(world_model, selected.path / ADAPTER, trainable=False)
-    note = note_on_describe_untrained_model(config, selected)
+    note = note_on_untrained_model(config, selected)
     if note and is_first_process():
         logger.warning(note)
     is_base = bool(note) and describe_untrained_model(config, selected.path) == BASE_MODEL
@@ -118,13 +118,13 @@ def describe_untrained_model(config: Config, checkpoint: Path) -> str:
     return BASE_MODEL
 
 
-def note_on_describe_untrained_model(config: Config, chosen: SelectedCheckpoint) -> str:
+def note_on_untrained_model(config: Config, chosen: SelectedCheckpoint) -> str:
     """Return a sentence if a checkpoint is the untrained model, with why it was selected; otherwise ""."""
     if parse_step(chosen.path.name):
         return ""
     untrained, state = describe_untrained_model(config, chosen.path), chosen.newest
-    if chosen.by not in {SELECTED, BEST}:
-        return f"{'The newest checkpoint' if chosen.by == NEWEST else 'Checkpoint 0'} is the {untrained}."
+    if chosen.selection not in {SELECTED, BEST}:
+        return f"{'The newest checkpoint' if chosen.selection == NEWEST else 'Checkpoint 0'} is the {untrained}."
     if state.step < min(config.validation.every, config.training.steps):
         return f"The selected checkpoint is the {untrained}: no later checkpoint has been validated."
     training = "training" if config.model.is_random else "fine-tuning"
@@ -140,13 +140,13 @@ def describe_selection(folder: Path) -> str:
     """
     config, chosen = read_run_config(folder), select_checkpoint(folder)
     state, step = chosen.newest, parse_step(chosen.path.name) or 0
-    lines = [f"Selected checkpoint: step {step:,}, {chosen.why}."]
+    lines = [f"Selected checkpoint: step {step:,}, {chosen.reason}."]
     if state.best_ranking_error is not None:
         base = ""
         if step and state.base_ranking_error is not None:
             base = f"{describe_untrained_model(config, chosen.path)} {100 * state.base_ranking_error:.1f} %, "
         lines.append(f"Action-ranking error in validation: {100 * state.best_ranking_error:.1f} % ({base}chance 50 %).")
-    return "\n".join(filter(None, (*lines, note_on_describe_untrained_model(config, chosen))))
+    return "\n".join(filter(None, (*lines, note_on_untrained_model(config, chosen))))
 
 
 def read_config_of_moved_run(folder: Path, overrides: Iterable[str]) -> Config:

@@ -50,13 +50,13 @@ _BLOCKS = (2, 3)  # numbers of blocks of the two measured models
 _BYTES_OF_CACHED = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
 _SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # elements, as in bitsandbytes
 _CHECKPOINTED = ", checkpointed"
-_STANDING = (  # parts that are allocated all the time
+_PERMANENT_PARTS = (  # parts that are allocated all the time
     "encoder weights", "predictor weights", "trained weights", "optimizer state", "CUDA allowance",
 )  # fmt: skip
-_OF_LOSS = {"loss", "rollout_steps"}
-_WITH_EFFECT: Any = {
+_LOSS_KEYS = {"loss", "rollout_steps"}
+_RELEVANT_KEYS: Any = {  # config keys on which the memory of a step depends
     "plugins": True, "adapter": True, "model": {"dtype"}, "data": {"frames"}, "validation": {"batch_size"},
-    "training": {"attention", "precision", "batch_size", *_OF_LOSS},
+    "training": {"attention", "precision", "batch_size", *_LOSS_KEYS},
 }  # fmt: skip
 
 
@@ -110,7 +110,7 @@ def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> St
     Raises:
         InputError: A key of the adapter does not fit the predictor.
     """
-    key = f"{config.model_dump_json(include=_WITH_EFFECT)} {sizes} {device}"
+    key = f"{config.model_dump_json(include=_RELEVANT_KEYS)} {sizes} {device}"
     if key not in _measured:
         depth = sizes.predictor.depth
         if depth <= _BLOCKS[1] or config.adapter.peft:  # options of PEFT may make blocks differ
@@ -126,7 +126,7 @@ def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> St
 
 
 class LiveStorages:
-    """A count of the bytes of tensor storages, from the first call of `hold` until a storage is freed.
+    """A count of the bytes of tensor storages, from the first call of `count` until a storage is freed.
 
     Args:
         block: The size of each storage is rounded up to a multiple of this number of bytes, as an allocator does.
@@ -146,7 +146,7 @@ class LiveStorages:
         self._sizes = dict.fromkeys(self._sizes, 0)
         self.live = self.peak = 0
 
-    def hold(self, tensor: Tensor) -> None:
+    def count(self, tensor: Tensor) -> None:
         """Count the storage of a tensor, unless it is counted already."""
         storage = tensor.untyped_storage()
         key = storage._cdata
@@ -154,13 +154,13 @@ class LiveStorages:
             self._sizes[key] = -(-storage.nbytes() // self._block) * self._block
             self.live += self._sizes[key]
             self.peak = max(self.peak, self.live)
-            weakref.finalize(storage, self._let_go, key)
+            weakref.finalize(storage, self._release, key)
 
-    def _let_go(self, key: int) -> None:
+    def _release(self, key: int) -> None:
         self.live -= self._sizes.pop(key)
 
 
-class _Holding(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
+class _StorageCounter(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
     """A dispatch mode that counts the storages of all tensors that operations return."""
 
     def __init__(self) -> None:
@@ -171,11 +171,11 @@ class _Holding(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
         kwargs = kwargs or {}
         if "out" in kwargs:  # the storage is counted already, and PyTorch takes milliseconds to check its shape
             return kwargs["out"]
-        made = func(*args, **kwargs)
-        for leaf in tree_leaves(made):
+        outputs = func(*args, **kwargs)
+        for leaf in tree_leaves(outputs):
             if isinstance(leaf, Tensor):
-                self.storages.hold(leaf)
-        return made
+                self.storages.count(leaf)
+        return outputs
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
@@ -190,21 +190,21 @@ class _FakeModel(LatentDynamics):
         self.predictor, self._storages = predictor, storages
         self.peaks: list[int] = []  # bytes, one per phase
         frozen = torch.bfloat16 if config.model.dtype == "bfloat16" else torch.float32
-        for part in predictor.modules():
-            for name, old in part.named_parameters(recurse=False):
+        for module in predictor.modules():
+            for name, old in module.named_parameters(recurse=False):
                 is_float = old.requires_grad or config.adapter.kind == "none"
                 values = torch.empty(old.shape, dtype=torch.float32 if is_float else frozen)
                 new = nn.Parameter(values, old.requires_grad)
                 new.grad = torch.empty_like(new) if new.requires_grad else None  # as after an earlier micro-step
-                part.register_parameter(name, new)
+                module.register_parameter(name, new)
             if device == "cuda":
-                part.__class__ = _ON_CUDA.get(type(part), type(part))
+                module.__class__ = _ON_CUDA.get(type(module), type(module))
         kind = config.training.attention
         self.set_attention(_flash if device == "cuda" and kind == "auto" else kind)
 
-    def predict(self, *given: Any, **named: Any) -> Tensor:
+    def predict(self, *args: Any, **kwargs: Any) -> Tensor:
         """Predict and end a phase; end another phase when the backward pass reaches this prediction."""
-        predicted = super().predict(*given, **named)
+        predicted = super().predict(*args, **kwargs)
         self.end_phase()
         if predicted.requires_grad:
             predicted.register_hook(self.end_phase)  # type: ignore[no-untyped-call]  # torch
@@ -238,11 +238,11 @@ def _measure(config: Config, sizes: ModelSizes, device: Kind) -> tuple[tuple[int
     predictor = meta_predictor(config, sizes)
     rotary_tables.cache_clear()  # neither use real tables from earlier calls nor leave fake tables for later calls
     try:
-        with FakeTensorMode(), _Holding() as holding:
-            model = _FakeModel(config, predictor, device, holding.storages)
-            before = holding.storages.live
+        with FakeTensorMode(), _StorageCounter() as counter:
+            model = _FakeModel(config, predictor, device, counter.storages)
+            before = counter.storages.live
             matrices = CastMatrices(model, PRECISIONS[config.training.precision])
-            casts = holding.storages.live - before
+            casts = counter.storages.live - before
             with matrices.use():
                 stored = model.run(config, sizes, config.training.batch_size, train=True)
                 model.set_gradient_checkpointing(True)
@@ -304,8 +304,8 @@ class MemoryEstimate:
         encoding = parts["encoder activations"] + parts["batch"]  # the batch is freed when its latents are computed
         computing = parts["latents"] + max(encoding, predicting)
         training = parts["gradients"] + max(computing, old_weights)
-        standing = sum(parts[name] for name in _STANDING)
-        return max(standing + max(training, parts["validation"]), parts["encoding the cache"])
+        permanent = sum(parts[name] for name in _PERMANENT_PARTS)
+        return max(permanent + max(training, parts["validation"]), parts["encoding the cache"])
 
 
 def count_parameters(config: Config, sizes: ModelSizes) -> Parameters:
@@ -317,12 +317,12 @@ def count_parameters(config: Config, sizes: ModelSizes) -> Parameters:
         InputError: A key of the adapter does not fit the predictor.
     """
     weights = list(meta_predictor(config, sizes).parameters())
-    trained = tuple(one.numel() for one in weights if one.requires_grad)
-    total = sum(one.numel() for one in weights)
-    own = total if config.adapter.kind == "none" else total - sum(trained)
+    trained = tuple(weight.numel() for weight in weights if weight.requires_grad)
+    total = sum(weight.numel() for weight in weights)
+    predictor = total if config.adapter.kind == "none" else total - sum(trained)
     with torch.device("meta"):
-        encoder = sum(one.numel() for one in Encoder(sizes).parameters())  # in V-JEPA 2.1 with both patch embeddings
-    return Parameters(encoder, own, trained)
+        encoder = sum(weight.numel() for weight in Encoder(sizes).parameters())  # 2.1 has two patch embeddings
+    return Parameters(encoder, predictor, trained)
 
 
 def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
@@ -343,12 +343,12 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
         "predictor weights": parameters.predictor * number if config.adapter.kind == "lora" else 0,  # frozen
         "trained weights": trained,
         "gradients": trained,
-        "optimizer state": sum(_moments(config, elements) for elements in parameters.trained_tensors),
+        "optimizer state": sum(_moment_bytes(config, elements) for elements in parameters.trained_tensors),
         "batch": batch_bytes(config, sizes, config.training.batch_size),
-        "latents": _latents(config, sizes, config.training.batch_size),
-        "encoder activations": _encoding(config, sizes, config.training.batch_size),  # before the predictor runs
-        "validation": _validating(config, sizes, step),
-        "encoding the cache": 0 if config.data.cache == "off" else encoder + _caching(config, sizes),
+        "latents": _latent_bytes(config, sizes, config.training.batch_size),
+        "encoder activations": _encoding_bytes(config, sizes, config.training.batch_size),  # before the predictor runs
+        "validation": _validation_bytes(config, sizes, step),
+        "encoding the cache": 0 if config.data.cache == "off" else encoder + _caching_bytes(config, sizes),
         "predictor activations": step.stored,
         f"predictor activations{_CHECKPOINTED}": step.checkpointed,
         "adapter copies": step.casts,
@@ -392,7 +392,7 @@ def _memory_savings(config: Config) -> Iterator[tuple[str, dict[str, dict[str, A
         yield "adapter.kind=lora", {"adapter": {"kind": "lora"}}
 
 
-def _moments(config: Config, elements: int) -> int:
+def _moment_bytes(config: Config, elements: int) -> int:
     """Return the bytes of AdamW's two moments for one tensor.
 
     With `adamw_8bit` there is one float32 scale for every 256 elements; moments of small tensors stay in float32.
@@ -412,22 +412,22 @@ def batch_bytes(config: Config, sizes: ModelSizes, clips: int) -> int:
     return frames * sizes.tokens_per_frame * sizes.encoder.width * _BYTES_OF_CACHED[config.data.cache_dtype]
 
 
-def _latents(config: Config, sizes: ModelSizes, clips: int) -> int:
+def _latent_bytes(config: Config, sizes: ModelSizes, clips: int) -> int:
     return clips * config.data.frames * sizes.tokens_per_frame * sizes.encoder.width * FLOAT32
 
 
-def _encoding(config: Config, sizes: ModelSizes, clips: int) -> int:
+def _encoding_bytes(config: Config, sizes: ModelSizes, clips: int) -> int:
     """Return the peak bytes of encoding clips: the larger half of an encoder block, the frames, and the features."""
-    return 0 if config.data.uses_cached_latents else _at_work(config, sizes, clips * config.data.frames)
+    return 0 if config.data.uses_cached_latents else _encoder_bytes(config, sizes, clips * config.data.frames)
 
 
-def _caching(config: Config, sizes: ModelSizes) -> int:
-    """Return the peak bytes of encoding a cache, with the frames that wait as input, without the encoder's weights."""
-    waiting = FRAMES_AT_ONCE * 3 * sizes.image_size**2 * (FLOAT32 + 1)
-    return ALLOWANCE + waiting + _at_work(config, sizes, ENCODE_CHUNK)
+def _caching_bytes(config: Config, sizes: ModelSizes) -> int:
+    """Return the peak bytes of encoding a cache, including the queued input frames, without the encoder's weights."""
+    queued = FRAMES_AT_ONCE * 3 * sizes.image_size**2 * (FLOAT32 + 1)
+    return ALLOWANCE + queued + _encoder_bytes(config, sizes, ENCODE_CHUNK)
 
 
-def _at_work(config: Config, sizes: ModelSizes, frames: int) -> int:
+def _encoder_bytes(config: Config, sizes: ModelSizes, frames: int) -> int:
     width, hidden = sizes.encoder.width, int(sizes.encoder.width * sizes.encoder.mlp_ratio)
     number = FLOAT32 if config.training.precision == "fp32" else HALF
     tokens = min(ENCODE_CHUNK, frames) * sizes.tokens_per_frame
@@ -438,15 +438,15 @@ def _at_work(config: Config, sizes: ModelSizes, frames: int) -> int:
     return tokens * max(attention, mlp) + pixels + features
 
 
-def _validating(config: Config, sizes: ModelSizes, step: StepBytes) -> int:
+def _validation_bytes(config: Config, sizes: ModelSizes, step: StepBytes) -> int:
     """Return the peak bytes of a validation batch, without gradients.
 
     It is the larger of encoding and predicting. Predicting needs two predictions of all latents, and the larger of the
     activations of one prediction of all steps and the keys and values that a rollout keeps (all steps but the last 2).
     """
     clips, predictor = config.validation.batch_size, sizes.predictor
-    latents, number = _latents(config, sizes, clips), FLOAT32 if config.training.precision == "fp32" else HALF
+    latents, number = _latent_bytes(config, sizes, clips), FLOAT32 if config.training.precision == "fp32" else HALF
     tokens = sizes.tokens_per_frame + 1 + predictor.use_states + predictor.use_extrinsics
     cached = 2 * predictor.depth * clips * (config.data.frames - 2) * tokens * predictor.width * number
-    encoding = _encoding(config, sizes, clips) + batch_bytes(config, sizes, clips)
+    encoding = _encoding_bytes(config, sizes, clips) + batch_bytes(config, sizes, clips)
     return latents + max(encoding, 2 * latents + max(cached, step.predicting))

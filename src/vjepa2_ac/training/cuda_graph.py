@@ -27,11 +27,11 @@ class GraphedMicroStep:
     """A micro-step that is captured once, and replayed for batches with the tensor sizes and `parts` of the first one.
 
     Args:
-        capture: Captures a function and returns a function that replays it; `captured` if None.
+        capture: Captures a function and returns a function that replays it; `capture_graph` if None.
     """
 
     def __init__(self, capture: Callable[[Body], Body] | None = None) -> None:
-        self._capture = capture or captured
+        self._capture = capture or capture_graph
         self._graph: _Graph | None = None
 
     def __call__(self, run: Run, latents: LatentBatch, parts: float) -> Float[Tensor, 2]:
@@ -92,7 +92,7 @@ def _restore(trained: Sequence[nn.Parameter], gradients: Sequence[Tensor | None]
         torch._foreach_zero_(fresh)
 
 
-def captured(body: Body) -> Body:
+def capture_graph(body: Body) -> Body:
     """Capture a function in a CUDA graph, after warm-up runs, and return the function that replays it.
 
     Source: PyTorch's notes on CUDA graphs, "Whole-network capture": warm-up and capture on a side stream.

@@ -25,7 +25,7 @@ from vjepa2_ac.training.setup import set_up
 from vjepa2_ac.training.step import Run, batches_from, gradients, training_step
 from vjepa2_ac.training.validation import record, validate_base, validate_if_due
 
-_IN_PLACE = "All checks passed: data, model, validation and gradients. Nothing was written."
+_CHECKS_PASSED = "All checks passed: data, model, validation and gradients. Nothing was written."
 
 
 def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False) -> Path:
@@ -59,11 +59,11 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
             if check_only:
                 reporter.task("computing one optimizer step")
                 gradients(run, batches_from(run))
-                reporter.note(_IN_PLACE)
+                reporter.note(_CHECKS_PASSED)
             else:
                 outputs.begin(run)
                 if base_validation is not None and record(run, base_validation, outputs.metrics_log):
-                    outputs.save()  # the untrained state, so that no checkpoint that is worse is ever selected as best
+                    outputs.save()  # the untrained state, so that no worse checkpoint can become the best one
                 _optimize(run, outputs, reporter)
     leave_processes()
     return Path(outputs.config.run_dir)

@@ -42,10 +42,10 @@ _ERRORS = {
     "error_over_persistence": "one-step error",
     "rollout_over_persistence_last": "rollout error at the last horizon",
 }
-_NOISE = 1.01  # factor; smaller increases of a validation error are ignored
-_LOSSES = 10  # number of `train` rows whose median is compared
-_FEWEST_LOSSES = 5
-_FAR_ABOVE = 2.0  # a median above this multiple of the lowest median causes a warning
+_MIN_INCREASE = 1.01  # factor; smaller increases of a validation error are ignored
+_NUM_LOSSES = 10  # number of `train` rows whose median is compared
+_MIN_LOSSES = 5
+_LOSS_RATIO = 2.0  # a median above this multiple of the lowest median causes a warning
 
 
 class DivergenceWarningLog(MetricsLog):
@@ -62,14 +62,14 @@ class DivergenceWarningLog(MetricsLog):
 
     def __init__(self, config: Config, reporter: Reporter, *, first_step: int, trackers: Trackers) -> None:
         super().__init__(Path(config.run_dir), first_step=first_step, trackers=trackers)
-        self._watch, self._reporter = DivergenceDetector(config), reporter
+        self._detector, self._reporter = DivergenceDetector(config), reporter
         for row in read_metrics_log(self.path):
-            self._watch(str(row.get("kind")), row["step"], row)
+            self._detector(str(row.get("kind")), row["step"], row)
 
     def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Append a row, and a warning if the row shows that training diverges."""
         super().write(kind, step, metrics)
-        if text := self._watch(kind, step, metrics):
+        if text := self._detector(kind, step, metrics):
             super().write(WARNING, step, {"text": text})
             self._reporter.note(f"Warning: {text}")
 
@@ -81,18 +81,18 @@ class DivergenceDetector:
         self._config = config
         self._reported: set[str] = set()
         self._at_start: Mapping[str, Any] = {}  # metrics of the validation before the first step
-        self._losses: deque[float] = deque(maxlen=_LOSSES)
+        self._losses: deque[float] = deque(maxlen=_NUM_LOSSES)
         self._lowest = math.inf
 
     def __call__(self, kind: str, step: int, metrics: Mapping[str, Any]) -> str:
         """Return the warning for a row; empty if there is no cause, or if the cause was reported before."""
         causes: Iterable[tuple[str, str]] = ()
         if kind == "train":
-            causes = self._of_loss(_number(metrics, "loss"))
+            causes = self._check_loss(_number(metrics, "loss"))
         elif kind == "validation" and step == 0:
             self._at_start = metrics
         elif kind == "validation":
-            causes = self._of_validation(metrics)
+            causes = self._check_validation(metrics)
         new = {cause: text for cause, text in causes if cause not in self._reported}
         self._reported |= set(new)
         training = self._config.training
@@ -102,14 +102,14 @@ class DivergenceDetector:
         )
         return f"at step {step:,} {'; '.join(new.values())}. {fix}" if new else ""
 
-    def _of_validation(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    def _check_validation(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         better = True
         for key, name in _ERRORS.items():
             now, before = _number(metrics, key), _number(self._at_start, key)
             better &= now < before
             if not math.isfinite(now):
                 yield "not finite", "an error of the validation is not a finite number"
-            elif now > _NOISE * before:
+            elif now > _MIN_INCREASE * before:
                 copying = "; copying the last frame would be better" if now > 1.0 > before else ""
                 text = f"the {name} in validation is {now:.3f} of persistence's (before training {before:.3f})"
                 yield name + copying, text + copying
@@ -120,15 +120,18 @@ class DivergenceDetector:
             text += ", although predictions are better than the base model's" if better else ""
             yield "rank", f"{text}. `vjepa2-ac data check` measures how diverse the motions of the data are"
 
-    def _of_loss(self, loss: float) -> Iterator[tuple[str, str]]:
+    def _check_loss(self, loss: float) -> Iterator[tuple[str, str]]:
         if not math.isfinite(loss):  # a step without readable clips
             return
         self._losses.append(loss)
         typical = statistics.median(self._losses)
-        if len(self._losses) >= _FEWEST_LOSSES:
+        if len(self._losses) >= _MIN_LOSSES:
             self._lowest = min(self._lowest, typical)
-        if typical > _FAR_ABOVE * self._lowest:
-            yield "loss", f"the loss is {typical:.4g}, its minimum was {self._lowest:.4g} (medians of {_LOSSES} rows)"
+        if typical > _LOSS_RATIO * self._lowest:
+            yield (
+                "loss",
+                f"the loss is {typical:.4g}, its minimum was {self._lowest:.4g} (medians of {_NUM_LOSSES} rows)",
+            )
 
 
 class TimedBatches(Iterator[Batch]):

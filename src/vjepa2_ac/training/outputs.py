@@ -43,7 +43,7 @@ class RunOutputs:
         config: The config of the run.
         reporter: Receives messages.
         accelerator: The processes of the run.
-        closing: An exit stack that closes everything that is opened here.
+        exit_stack: An exit stack that closes everything that is opened here.
         check_only: Write nothing.
         allow_config_change: Accept that the run in the folder has another config.
 
@@ -56,12 +56,12 @@ class RunOutputs:
         config: Config,
         reporter: Reporter,
         accelerator: Accelerator,
-        closing: contextlib.ExitStack,
+        exit_stack: contextlib.ExitStack,
         *,
         check_only: bool,
         allow_config_change: bool,
     ) -> None:
-        self._reporter, self._closing = reporter, closing
+        self._reporter, self._exit_stack = reporter, exit_stack
         self.metrics_log: MetricsLog | None = None
         self._mirror: Mirror | None = None
         self._stopped_by = 0  # number of a signal
@@ -69,15 +69,15 @@ class RunOutputs:
 
         def open_folder() -> OpenRun:
             require_installed(config.tracking)
-            opened = open_run(config, reporter, check_only=check_only, allow_config_change=allow_config_change)
-            return closing.enter_context(opened)
+            context = open_run(config, reporter, check_only=check_only, allow_config_change=allow_config_change)
+            return exit_stack.enter_context(context)
 
-        self._opened = run_on_first(accelerator, open_folder)  # None in other processes
-        self.config = broadcast_object(accelerator, self._opened.config if self._opened else config)
-        has_ended = run_on_first(accelerator, lambda: not check_only and self._finish_ended())
+        self._open_run = run_on_first(accelerator, open_folder)  # None in other processes
+        self.config = broadcast_object(accelerator, self._open_run.config if self._open_run else config)
+        has_ended = run_on_first(accelerator, lambda: not check_only and self._finish_if_ended())
         self.has_ended = bool(broadcast_object(accelerator, has_ended))
 
-    def _finish_ended(self) -> bool:
+    def _finish_if_ended(self) -> bool:
         """Return whether the run has ended already; if so, write the config and finish the mirror."""
         newest = newest_checkpoint(Path(self.config.run_dir, CHECKPOINTS))
         if (
@@ -87,15 +87,15 @@ class RunOutputs:
         ):
             return False
         write_config(self.config)
-        self._reporter.note(_why_ended(self.config, state))
-        if self._opened is not None and (mirror := self._opened.mirror(state.run_id)) is not None:
+        self._reporter.note(_describe_end(self.config, state))
+        if self._open_run is not None and (mirror := self._open_run.mirror(state.run_id)) is not None:
             with mirror:
                 mirror.finish(lambda: False)
         return True
 
     def report_changes(self, run: Run) -> None:
         """Print the config changes since the last start, and the learning rate if they change it."""
-        if self._opened is None:
+        if self._open_run is None:
             return
         changes = config_changes(run.config)
         for line in changes:
@@ -108,23 +108,23 @@ class RunOutputs:
         """Open the metrics log, the trackers and the mirror, and install the signal handlers."""
         self._run, self._saved_step, self._saved_s = run, run.state.step, time.monotonic()
         run_on_all(run.accelerator, self._begin)
-        self._stop = self._closing.enter_context(stop_on_signals())
+        self._stop = self._exit_stack.enter_context(stop_on_signals())
 
     def _begin(self) -> None:
-        if self._opened is None:
+        if self._open_run is None:
             return
         run, step, run_id = self._run, self._run.state.step, self._run.state.run_id
-        self._opened.begin(run.config, run.state)
+        self._open_run.begin(run.config, run.state)
         if run.calibration is not None:
             write_atomically(run.folder / CALIBRATION, json.dumps(run.calibration, indent=1).encode())
         measure_coverage = TRAINING_HOOKS.find("coverage")
         if not (run.folder / CHANGES).exists() and (coverage := measure_coverage(run.dataset)) is not None:
             write_atomically(run.folder / CHANGES, json.dumps(coverage.noted()).encode())
         trackers = open_trackers(run.config, run.folder, run_id=run_id, first_step=step)
-        watched = DivergenceWarningLog(run.config, self._reporter, first_step=step, trackers=trackers)
-        self.metrics_log = self._closing.enter_context(watched)
-        if (mirror := self._opened.mirror(run_id)) is not None:
-            self._mirror = self._closing.enter_context(mirror)
+        metrics_log = DivergenceWarningLog(run.config, self._reporter, first_step=step, trackers=trackers)
+        self.metrics_log = self._exit_stack.enter_context(metrics_log)
+        if (mirror := self._open_run.mirror(run_id)) is not None:
+            self._mirror = self._exit_stack.enter_context(mirror)
 
     @property
     def has_next_step(self) -> bool:
@@ -187,7 +187,7 @@ class RunOutputs:
         run = self._run
         has_ended = is_finished(run.config, run.state)
         if has_ended and run.state.step < run.config.training.steps:
-            self._reporter.note(_why_ended(run.config, run.state))
+            self._reporter.note(_describe_end(run.config, run.state))
 
         def finish_mirror() -> None:
             if self._mirror is not None:
@@ -198,7 +198,7 @@ class RunOutputs:
             raise StoppedError(run.folder, run.state.step, signal.Signals(self._stopped_by).name)
 
 
-def _why_ended(config: Config, state: RunState) -> str:
+def _describe_end(config: Config, state: RunState) -> str:
     """Return why training ends at a step."""
     if state.step >= config.training.steps:
         return f"Training is finished after {counted(config.training.steps, 'step')} (training.steps)."

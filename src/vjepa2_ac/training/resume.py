@@ -39,7 +39,7 @@ from vjepa2_ac.runs.metrics_log import warn_if_stalled
 from vjepa2_ac.training.optim import load_moments
 from vjepa2_ac.training.step import Run
 
-_CLIPS = "its clips"  # key of the hash of the validation clips, in state.json
+_CLIPS_KEY = "its clips"  # key of the hash of the validation clips, in state.json
 
 
 def save_checkpoint(run: Run, folder: Path) -> None:
@@ -57,8 +57,8 @@ def save_checkpoint(run: Run, folder: Path) -> None:
     run.state = replace(
         run.state,
         data=tuple(
-            DataState(compute_fingerprint(one.table), len(one.windows("train")), one.broken.reasons)
-            for one in run.datasets
+            DataState(compute_fingerprint(dataset.table), len(dataset.windows("train")), dataset.broken.reasons)
+            for dataset in run.datasets
         ),
         clips_per_step=run.clips_per_step,
         clips_per_process=run.config.training.batch_size * run.config.training.accumulation,
@@ -76,7 +76,7 @@ def restore(run: Run, reporter: Reporter) -> Run:
     Raises:
         InputError: The processes have different base models, or the checkpoint does not fit this run.
     """
-    state = _state_of_all(run, reporter)
+    state = _restore_in_all_processes(run, reporter)
     if state.loss_scale is not None and run.scaler.is_enabled():
         run.scaler.load_state_dict(dict(state.loss_scale))
     for dataset, before in zip(run.datasets, state.data, strict=False):
@@ -91,7 +91,7 @@ def restore(run: Run, reporter: Reporter) -> Run:
     return run
 
 
-def _state_of_all(run: Run, reporter: Reporter) -> RunState:
+def _restore_in_all_processes(run: Run, reporter: Reporter) -> RunState:
     """Restore weights and moments in all processes: the first process reads them and sends them to the others."""
     accelerator, world_model = run.accelerator, run.world_model
     encoder = world_model.adaptation.encoder if world_model.adaptation else ""
@@ -125,7 +125,7 @@ def validation_settings(config: Config, dataset: Dataset) -> Mapping[str, str]:
     settings = {key: json.dumps(value) for key, value in flatten(values_that_affect(Affects.MEASURED, config)).items()}
     windows = validation_windows(dataset, "validation", clips=config.validation.clips)
     clips = [(dataset.table.identity(episode), int(start)) for episode, start in windows]
-    return {**settings, _CLIPS: hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}
+    return {**settings, _CLIPS_KEY: hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}
 
 
 def keep_comparable_best(state: RunState, now: Mapping[str, str], reporter: Reporter) -> RunState:
@@ -137,7 +137,7 @@ def keep_comparable_best(state: RunState, now: Mapping[str, str], reporter: Repo
     before = state.validation_settings or {}
     differing = sorted(key for key in before.keys() & now if before[key] != now[key])
     state = replace(state, validation_settings=dict(now))
-    names = ["validation clips" if key == _CLIPS else key for key in differing]
+    names = ["validation clips" if key == _CLIPS_KEY else key for key in differing]
     if not differing or state.best_error is None:
         return state
     reporter.note(
@@ -170,11 +170,11 @@ def count_micro_batches(config: Config, state: RunState, processes: int, reporte
         return configured
     micro_batches = state.clips_per_step // batch_size
     if micro_batches < processes:
-        found = f"{counted(processes, 'process')}, each with micro-batches of {counted(batch_size, 'clip')}"
+        problem = f"{counted(processes, 'process')}, each with micro-batches of {counted(batch_size, 'clip')}"
         clips = counted(state.clips_per_step, "clip")
         needed = f"at most {counted(micro_batches, 'process')}, because a step of this run has {clips}"
         fix = "Start fewer processes, or change training.batch_size and training.accumulation with"
-        raise InputError(where="training.batch_size", found=found, needed=needed, fix=f"{fix} --allow-config-change")
+        raise InputError(where="training.batch_size", found=problem, needed=needed, fix=f"{fix} --allow-config-change")
     if micro_batches != configured:
         fewest, remainder = divmod(micro_batches, processes)
         each = f"{fewest} or {fewest + 1}" if remainder else f"{fewest}"

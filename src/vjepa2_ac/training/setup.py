@@ -70,7 +70,7 @@ def set_up(
         raise InputError(where="data.stride", found="auto, with model.base random", needed=needed, fix=fix)
     if config.training.compile == "blocks":
         require_compiler(accelerator.device.type, where="training.compile")
-    strip = TRAINING_HOOKS.find("validation.decoder")(config) if config.validation.decoder is not None else None
+    image_strip = TRAINING_HOOKS.find("validation.decoder")(config) if config.validation.decoder is not None else None
 
     # The other processes of a machine wait for the first process, and then read the index that the first one wrote.
     dataset, *replay_datasets = run_first_per_machine(accelerator, lambda: open_data_sets(config, reporter))
@@ -91,8 +91,8 @@ def set_up(
     base = world_model or load_base(config.model, seed=config.seed)
     run_on_first(accelerator, lambda: require_same_base(config, base))
     get_extrinsics(base, clip)
-    if strip is not None:
-        strip.require_fit(base, config)
+    if image_strip is not None:
+        image_strip.require_fit(base, config)
     _require_shared_memory(config, clip, base.sizes, accelerator)
     for replayed in replay_datasets:
         get_extrinsics(base, first_clip(replayed))
@@ -116,8 +116,8 @@ def set_up(
         state=RunState(step=0),
         micro_batches=config.training.accumulation * accelerator.num_processes,
         calibration=None if calibration is None else calibration.as_dict(),
-        replayed=replay_datasets[0] if replay_datasets else None,
-        strip=strip,
+        replay_dataset=replay_datasets[0] if replay_datasets else None,
+        image_strip=image_strip,
     )
 
 
@@ -136,8 +136,7 @@ def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, r
     reporter.note(str(trainable_report(world_model)))
     if problem := config.adapter.alpha_warning:
         reporter.note(f"Warning: {problem}.")
-    copies = config.model.is_random
-    if copies and (reason := world_model.sizes.narrow_predictor_warning):
+    if config.model.is_random and (reason := world_model.sizes.narrow_predictor_warning):
         reporter.note(f"Warning: {reason}.")
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
     world_model.set_attention(config.training.attention)
@@ -155,9 +154,9 @@ def _check_heads(config: Config, dataset: Dataset) -> None:
     """
     heads, widths = find_heads_to_replace(base_sizes(config.model), dataset.widths), dataset.widths
     if heads and config.data.stride == "auto":
-        found = f"auto, for states of {widths.state} and actions of {widths.action} numbers"
+        problem = f"auto, for states of {widths.state} and actions of {widths.action} numbers"
         needed = "the widths with which the base model was trained, because it is evaluated at each candidate stride"
-        raise InputError(where="data.stride", found=found, needed=needed, fix="Set it to a number of control steps")
+        raise InputError(where="data.stride", found=problem, needed=needed, fix="Set it to a number of control steps")
     require_trained_heads(heads, config.adapter)
 
 
@@ -195,21 +194,19 @@ def open_data_sets(config: Config, reporter: Reporter) -> list[Dataset]:
 def _open_replay(replay: ReplayConfig, dataset: Dataset, reporter: Reporter) -> Dataset:
     replayed = open_dataset(replay.data, progress=reporter.task(INDEXING))
     if replayed.widths != dataset.widths or replayed.spaces != dataset.spaces:
-        found, needed = (
+        problem, needed = (
             f"states of {opened.widths.state} and actions of {opened.widths.action} numbers ({opened.config.states})"
             for opened in (replayed, dataset)
         )
-        where, fix = (
-            f"replay.data.path: {replayed.config.path}",
-            "Use a replay data set with the same format of states and actions",
-        )
-        raise InputError(where=where, found=found, needed=f"{needed}, as in data", fix=fix)
-    found_s, needed_s = (opened.config.model_stride / opened.control_rate_hz for opened in (replayed, dataset))
-    if not math.isclose(found_s, needed_s, rel_tol=_STEP_TOLERANCE):  # data sets have different control rates
-        found = f"{replayed.config.stride}: model steps of {found_s:.3g} s"
-        needed = f"model steps of {needed_s:.3g} s, as in data (stride {dataset.config.stride})"
-        fix = f"Set replay.data.stride={needed_s * replayed.control_rate_hz:.3g}, or change data.stride"
-        raise InputError(where="replay.data.stride", found=found, needed=needed, fix=fix)
+        where = f"replay.data.path: {replayed.config.path}"
+        fix = "Use a replay data set with the same format of states and actions"
+        raise InputError(where=where, found=problem, needed=f"{needed}, as in data", fix=fix)
+    replay_step_s, step_s = (opened.config.model_stride / opened.control_rate_hz for opened in (replayed, dataset))
+    if not math.isclose(replay_step_s, step_s, rel_tol=_STEP_TOLERANCE):  # data sets have different control rates
+        problem = f"{replayed.config.stride}: model steps of {replay_step_s:.3g} s"
+        needed = f"model steps of {step_s:.3g} s, as in data (stride {dataset.config.stride})"
+        fix = f"Set replay.data.stride={step_s * replayed.control_rate_hz:.3g}, or change data.stride"
+        raise InputError(where="replay.data.stride", found=problem, needed=needed, fix=fix)
     windows = replayed.windows("train")
     available = counted(len(windows), "clip")
     reporter.note(f"Replay: {replay.share:.0%} of the training clips are drawn from {replay.data.path} ({available}).")
@@ -228,7 +225,7 @@ def first_clip(dataset: Dataset, split: Split = "train") -> Batch:
     return next(validation_batches(dataset, split, clips=_CLIPS_TRIED, batch_size=1))
 
 
-def require_fitting_clips(first: Dataset, others: Sequence[Dataset]) -> None:
+def require_fitting_clips(first: Dataset, replay_datasets: Sequence[Dataset]) -> None:
     """Refuse a replay data set whose clips cannot be in one batch with those of the first data set.
 
     Data sets that are not encoded yet are accepted.
@@ -236,14 +233,15 @@ def require_fitting_clips(first: Dataset, others: Sequence[Dataset]) -> None:
     Raises:
         InputError: Frames differ in size, or latents in type; the message describes both.
     """
-    for replayed in others:
-        if any(one.config.uses_cached_latents and not one.config.is_cache for one in (first, replayed)):
+    for replayed in replay_datasets:
+        configs = (first.config, replayed.config)
+        if any(config.uses_cached_latents and not config.is_cache for config in configs):
             continue  # not encoded yet
-        found, needed = (_form(first_clip(dataset)) for dataset in (replayed, first))
-        if found != needed:
+        clips, needed = (_describe_clip(first_clip(dataset)) for dataset in (replayed, first))
+        if clips != needed:
             needed = f"{needed}, as in data, because a micro-batch has clips of both data sets"
             fix = "Set data.cache and replay.data.cache to auto, with the same cache_dtype"
-            raise InputError(where="replay.data", found=f"clips of {found}", needed=needed, fix=fix)
+            raise InputError(where="replay.data", found=f"clips of {clips}", needed=needed, fix=fix)
 
 
 def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
@@ -264,12 +262,12 @@ def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
         keys, datasets, earlier_configs, config.data_sets, states, strict=False
     ):
         if old_config.path != new_config.path and state.fingerprint != compute_fingerprint(dataset.table):
-            found, needed = (
-                "episodes or files that differ from those of the run",
-                f"the data set that was at {old_config.path}",
+            raise InputError(
+                where=f"{key}: {new_config.path}",
+                found="episodes or files that differ from those of the run",
+                needed=f"the data set that was at {old_config.path}",
+                fix=f"Set {key} to its new path. To resume with the other data, add --allow-config-change",
             )
-            fix = f"Set {key} to its new path. To resume with the other data, add --allow-config-change"
-            raise InputError(where=f"{key}: {new_config.path}", found=found, needed=needed, fix=fix)
 
 
 def require_same_base(config: Config, model: WorldModel) -> None:
@@ -284,7 +282,7 @@ def require_same_base(config: Config, model: WorldModel) -> None:
         read_card(checkpoint / ADAPTER, model)
 
 
-def _form(batch: Batch) -> str:
+def _describe_clip(batch: Batch) -> str:
     if batch.latents is not None:
         values = batch.latents.values
         scaled = " with scales" if batch.latents.scales is not None else ""

@@ -51,8 +51,8 @@ class Run:
     state: RunState
     micro_batches: int  # number per optimizer step, summed over all processes
     calibration: Mapping[str, Any] | None = None  # how the stride was chosen; None unless data.stride was auto
-    replayed: Dataset | None = None  # the replay data set
-    strip: Any = None  # the hook `validation.decoder`: decoding.imagine.ValidationStrip
+    replay_dataset: Dataset | None = None
+    image_strip: Any = None  # the hook `validation.decoder`: decoding.imagine.ValidationStrip
 
     @property
     def folder(self) -> Path:
@@ -62,7 +62,7 @@ class Run:
     @property
     def datasets(self) -> list[Dataset]:
         """The data set and, if configured, the replay data set."""
-        return [self.dataset] if self.replayed is None else [self.dataset, self.replayed]
+        return [self.dataset] if self.replay_dataset is None else [self.dataset, self.replay_dataset]
 
     @cached_property
     def trained(self) -> list[nn.Parameter]:
@@ -89,7 +89,7 @@ def batches_from(run: Run) -> Batches:
     """Return an iterator over the micro-batches of this process, starting at the current step."""
     replay = run.config.replay
     return training_loader(
-        MixedDataset(run.dataset, run.replayed, replay.share if replay else 0.0),
+        MixedDataset(run.dataset, run.replay_dataset, replay.share if replay else 0.0),
         seed=run.config.seed,
         batch_size=run.config.training.batch_size,
         start_position=run.state.clips_done,
@@ -304,9 +304,9 @@ def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str]) -> 
     if math.isfinite(loss) and (math.isfinite(norm) or overflow):
         return
     fp16 = ", or set training.precision to bf16 or fp32" if run.scaler.is_enabled() else ""
-    found = f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}"
+    problem = f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}"
     fix = f"The weights are unchanged. Inspect these clips, or lower training.learning_rate{fp16}"
-    raise InputError(where="training", found=found, fix=fix)
+    raise InputError(where="training", found=problem, fix=fix)
 
 
 class Update:

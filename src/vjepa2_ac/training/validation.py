@@ -22,9 +22,13 @@ from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.training.step import Run, encode
 
-BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best error: planning depends on the longest horizon
-RANK = "action_ranking_error"  # checkpoint.keep_best ranking
-USED = 0.02  # relative increase of the one-step error with shuffled actions, below which a model ignores its actions
+SELECTION_ERROR = (
+    "rollout_over_persistence_last"  # for checkpoint.keep_best=error: planning depends on the longest horizon
+)
+RANKING_ERROR = "action_ranking_error"  # for checkpoint.keep_best=ranking
+MIN_ACTION_EFFECT = (
+    0.02  # relative increase of the one-step error with shuffled actions, below which a model ignores its actions
+)
 RANKING_REACH_CM = 7.5  # half the width of the box of alternative actions: the motion of a plan in one model step
 _AT_ONCE = 64  # alternative actions per batch, about as many tokens as in a small micro-batch
 _BASE_NOT_CHECKED = (
@@ -48,12 +52,12 @@ def validate_if_due(run: Run, metrics_log: MetricsLog | None, reporter: Reporter
 def action_warning(validation: Validation) -> str:
     """Return a warning if the predictions hardly depend on the actions, otherwise an empty string."""
     cost = cost_of_actions(validation.errors, "shuffled").value
-    if cost >= USED:
+    if cost >= MIN_ACTION_EFFECT:
         return ""
     return (
-        f"Warning: shuffled actions change the one-step error by {cost:+.1%} (expected: at least +{USED:.0%}). The"
-        " model ignores its actions and cannot be used for planning. Check the data's axes and stride (`vjepa2-ac data"
-        " check`); for training from scratch see docs/encoders.md"
+        f"Warning: shuffled actions change the one-step error by {cost:+.1%} (expected: at least"
+        f" +{MIN_ACTION_EFFECT:.0%}). The model ignores its actions and cannot be used for planning. Check the data's"
+        " axes and stride (`vjepa2-ac data check`); for training from scratch see docs/encoders.md"
     )
 
 
@@ -62,14 +66,16 @@ def record(run: Run, validation: Validation, metrics_log: MetricsLog | None) -> 
     metrics = validation_metrics(validation)
     if metrics_log is not None:
         metrics_log.write("validation", run.state.step, metrics)
-        if run.strip is not None:
+        if run.image_strip is not None:
             with run.accelerator.autocast():
-                image = run.strip.draw(run.world_model, run.accelerator.device, run.folder, run.state.step)
+                image = run.image_strip.draw(run.world_model, run.accelerator.device, run.folder, run.state.step)
             if image is not None:
                 metrics_log.show("validation", "imagined", run.state.step, image)
-    by, before = run.config.checkpoint.keep_best, run.state
-    if by != "off":
-        run.state = before.with_validation(metrics[BEST_BY], metrics[RANK] if by == "ranking" else None)
+    criterion, before = run.config.checkpoint.keep_best, run.state
+    if criterion != "off":
+        run.state = before.with_validation(
+            metrics[SELECTION_ERROR], metrics[RANKING_ERROR] if criterion == "ranking" else None
+        )
     return run.state.best_step != before.best_step
 
 
@@ -94,7 +100,11 @@ def validation_metrics(validation: Validation) -> dict[str, Any]:
         "rollout_over_persistence_last": by_horizon[-1].value,
     }
     if (ranking := validation.ranking) is not None:
-        ranking_errors = {RANK: ranking.rank, f"{RANK}_box": ranking.box, f"{RANK}_shell": ranking.shell}
+        ranking_errors = {
+            RANKING_ERROR: ranking.rank,
+            f"{RANKING_ERROR}_box": ranking.box,
+            f"{RANKING_ERROR}_shell": ranking.shell,
+        }
         for name, estimate in {**ranking_errors, "energy_spread": ranking.spread}.items():
             metrics |= {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
     return metrics
@@ -147,8 +157,8 @@ def _encoded(
     """Yield the latents of batches, and append the moving steps of the clips in `chosen` to `moves`."""
     for batch in batches:
         latents = encode(run, batch)
-        if run.strip is not None:
-            run.strip.update(run.dataset, batch, latents)
+        if run.image_strip is not None:
+            run.image_strip.update(run.dataset, batch, latents)
         for row, name in enumerate(zip(latents.episode_ids, latents.starts, strict=True)):
             if name in chosen:
                 moves += select_moves(latents, row, run.dataset.spaces.action, RANKING_REACH_CM / 100)
