@@ -1,5 +1,6 @@
 """Arithmetic that a GPU lacks is refused by every entry point, slow one of a CPU told, before anything is loaded."""
 
+import importlib
 import importlib.util
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,10 @@ UNDER_AUTOCAST = ("train", "encode", "evaluate", "calibrate", "decoder")
 
 @pytest.fixture(params=[(7, 5)])
 def gpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine with a GPU of this compute capability, on which nothing can be done."""
+    """A machine with a GPU of this compute capability, on which nothing can be computed."""
+    importlib.import_module(
+        "peft"
+    )  # it imports bitsandbytes, whose import fails if CUDA is mocked without CUDA in torch
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda *_, **__: True)  # it emulates

@@ -121,6 +121,21 @@ def test_an_interval_has_the_direction_of_its_statement() -> None:
         assert 0 < low <= float(predicts.statement.split()[1]) <= high
 
 
+SHARES = {"adapter": estimate_share(45, 50), "random": estimate_share(0, 50), "oracle": estimate_share(50, 50)}
+
+
+def test_printed_interval_follows_its_number_and_one_line_names_its_unit() -> None:
+    summary = summary_of(ranked("base", 1.0, 0.2), ranked("adapter", 0.75, 0.02))
+    printed = str(summary)
+    ranking = summary.ranks_actions
+    assert f"{ranking.statement} {ranking.interval} (base model" in printed
+    assert "  Brackets: 95 % intervals over episodes\n" in printed
+    rate = closed_loop_verdict(SHARES, "adapter", "oracle", 50, "reach")
+    text = " ".join(str(replace(summary, plans=rate)).split())
+    assert f"success rate 90 % {rate.interval} on 50 reach problems" in text
+    assert "Brackets: 95 % intervals over episodes and (success rate) problems" in text
+
+
 def ranked(name: str, level: float, rank: float, **changes: Any) -> ModelResult:
     """Return a model with an error and an action-ranking error, which differs a little by clip."""
     ids = tuple(f"episode {clip % 8}" for clip in range(CLIPS))

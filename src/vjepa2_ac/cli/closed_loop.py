@@ -220,7 +220,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
         cli.show(title, benchmark_table(benchmark), files=files)
     summary = _summary(benchmark, verdict, options)
     cli.show(*benchmark_notes(benchmark), str(summary), *_next(summary, verdict, options))
-    cli.show(*(f"Film: {file}" for file in files[1:2]))
+    cli.show(*(f"Video: {file}" for file in files[1:2]))
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
 
 

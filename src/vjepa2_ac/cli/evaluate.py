@@ -108,8 +108,8 @@ def _evaluate(options: argparse.Namespace) -> None:
             tables = row_tables(make_rows(evaluation), "Held-out episodes")
             cli.show(name, *tables, *notes, files=measured.files)
         cli.show(str(measured.summary), *_next(measured, options))
-        film = "" if evaluation.decoded is None else "film and "
-        cli.show(f"Report with {film}all tables: {measured.report}")
+        video = "" if evaluation.decoded is None else "video and "
+        cli.show(f"Report with {video}all tables: {measured.report}")
     leave_processes()
 
 

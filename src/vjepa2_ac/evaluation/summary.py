@@ -33,6 +33,7 @@ CHANCE = 0.5  # action-ranking error of a model that ignores its actions
 _BASE, _PERSISTENCE, _CHANCE = "the base model", "persistence", "chance"  # values of `compared_with`
 _TOO_FEW = "too few for a conclusion"
 _COLUMNS, _NO_BREAK = 90, "\N{NO-BREAK SPACE}"
+_NUMBER = re.compile(r"\d[\d.]*(?: (?:%|cm))?")  # the first one in a statement is the verdict's number
 _wrap = partial(wrap, break_on_hyphens=False)  # commands and paths have hyphens
 
 
@@ -72,6 +73,15 @@ class Verdict:
         if self.unit == "%":
             return format_interval(Estimate(self.value, self.low, self.high))
         return f"[{self.low:z.1f}, {self.high:z.1f}]"
+
+    @property
+    def statement_with_interval(self) -> str:
+        """The statement with the interval directly after its number."""
+        number = _NUMBER.search(self.statement)
+        if number is None or not self.interval:
+            return self.statement
+        interval = self.interval.replace(" ", _NO_BREAK)
+        return f"{self.statement[: number.end()]}{_NO_BREAK}{interval}{self.statement[number.end() :]}"
 
 
 @dataclass(frozen=True)
@@ -136,6 +146,13 @@ class Summary:
             return "The error is lower with shuffled actions than with true ones. Check data, axes and stride first."
         return f"The model predicts typical motion and ignores the actions{self._unusable}."
 
+    @property
+    def _explained_brackets(self) -> list[str]:
+        """A line that explains the intervals; no line without an interval."""
+        intervals = {verdict is self.plans for verdict in self.verdicts if verdict.interval}
+        over = " and (success rate) ".join({False: "episodes", True: "problems"}[key] for key in sorted(intervals))
+        return [f"  Brackets: 95 % intervals over {over}"] if intervals else []
+
     def __str__(self) -> str:
         gap = _COLUMNS - len(self.subject) - len(self.measured)
         header = f"{self.subject}{' ' * gap}{self.measured}"
@@ -144,12 +161,10 @@ class Summary:
         width = max(len(verdict.conclusion) for verdict in self.verdicts)
         for verdict in self.verdicts:
             label = f"  {verdict.name:<{names}}  {verdict.conclusion:<{width}}  "
-            room = _COLUMNS - len(label) - len(verdict.interval) - 1
-            text = _with_fixed_units(f"{verdict.statement} {verdict.reference}")
-            first = _wrap(text, room)[0]
-            lines.append(f"{label}{first:<{room}} {verdict.interval}".rstrip())
-            rest = _wrap(text[len(first) :].lstrip(), _COLUMNS - len(label))
-            lines += (" " * len(label) + line for line in rest)
+            text = _with_fixed_units(f"{verdict.statement_with_interval} {verdict.reference}")
+            first, *rest = _wrap(text, _COLUMNS - len(label))
+            lines += (label + first, *(" " * len(label) + line for line in rest))
+        lines += self._explained_brackets
         lines += _wrap(_with_fixed_units(self.sentence), _COLUMNS)
         return "\n".join(lines).replace(_NO_BREAK, " ")
 
