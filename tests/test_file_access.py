@@ -80,7 +80,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     f"latents/{EPISODES_FILE}": lambda root: read_table(str(root / "latents" / EPISODES_FILE), EpisodeTable),
     "metrics.json": read_metrics,
 }
-CACHED = "index/key.index"  # it is built again where it was read and found wrong
+CACHED = "index/key.index"  # a damaged index is built again instead of raising
 
 
 @pytest.fixture(scope="module")

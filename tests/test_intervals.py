@@ -28,7 +28,7 @@ def test_interval_coverage_equals_the_stated_rate(episodes: int) -> None:
     covered = 0
     ids = tuple(str(number) for number in np.repeat(np.arange(episodes), 4))
     for _ in range(400):
-        levels = rng.normal(0.7, 0.1, size=episodes)  # episodes differ; clips within one are alike
+        levels = rng.normal(0.7, 0.1, size=episodes)  # episodes differ; clips of one episode are similar
         errors = np.repeat(levels, 4) + rng.normal(0, 0.02, size=4 * episodes)
         columns = np.stack([errors, np.ones(4 * episodes)])[:, :, None]
         (found,) = bootstrap(lambda sums: sums[0] / sums[1], columns, ids)
@@ -54,7 +54,7 @@ def test_interval_level_is_widened_for_few_episodes() -> None:
 
 
 def test_bootstrap_draws_whole_episodes() -> None:
-    """Two episodes: each alone or both are all that can be drawn, and the interval reaches from end to end."""
+    """With two episodes a draw has one of them twice, or both, so the interval spans both values."""
     found = estimate_mean(np.array([1.0, 1.0, 5.0]), ("a", "a", "b"))
     assert (found.low, found.value, found.high) == pytest.approx((1.0, 7 / 3, 5.0), abs=0.01)
 

@@ -97,7 +97,7 @@ def test_pose_frame_is_the_config_frame_and_reading_uses_the_base_frame() -> Non
     assert get_state_space(camera, 7) == POSE
 
 
-# What is given to plan from
+# Checks of the state to plan from
 
 
 def changed(place: int, value: float) -> np.ndarray:

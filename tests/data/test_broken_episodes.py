@@ -18,7 +18,7 @@ from vjepa2_ac.data.loader import read_batches
 from vjepa2_ac.data.selection import max_broken
 from vjepa2_ac.errors import InputError
 
-Use = Callable[..., Dataset]  # opens a data set with some config values, and reads it
+Use = Callable[..., Dataset]  # opens a data set with the given config values, and reads it
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def test_transforms_depend_on_seed_and_position_and_apply_to_training_clips_only
     dataset = open_set(OFFSET, validation_share=0.5)
     plain = open_set(validation_share=0.5)
     offsets = (frames(dataset, 20) - frames(plain, 20))[:, 0, 0, 0]
-    assert torch.equal(offsets[:, 0], offsets[:, 1])  # one number for a clip
+    assert torch.equal(offsets[:, 0], offsets[:, 1])  # one random number per clip
     assert 10 < len(set(offsets[:, 0].tolist())) <= 40
     assert torch.equal(frames(dataset, 20), frames(dataset, 20))
     other = (frames(dataset, 20, seed=2) - frames(plain, 20, seed=2))[:, 0, 0, 0]

@@ -182,12 +182,12 @@ def test_conversion_writes_whole_episodes_and_omits_excluded_ones(droid: Path, t
     assert read_back(tmp_path / "less", "exterior_1_left").table.num_steps.tolist() == [16, 13, 15]
 
 
-# What cannot be written.
+# Data sets that cannot be written.
 
 
 def damaged(spoiled: Callable[..., Path]) -> Path:
     def spoil(features: dict[str, tuple[Any, Any]]) -> None:
-        features["steps/observation/wrist_image_left"][1][9] = b"GIF89a"  # after frames that were written already
+        features["steps/observation/wrist_image_left"][1][9] = b"GIF89a"  # after other frames were written
 
     return spoiled(spoil)
 

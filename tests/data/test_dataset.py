@@ -90,7 +90,7 @@ def two_ranges_each(table: EpisodeTable) -> StepSelection:
 
 
 @pytest.mark.parametrize("idle", [{}, {"rule": "motion"}])
-def test_opening_a_data_set_of_droids_size_takes_no_call_per_episode_and_50_mb(
+def test_opening_a_data_set_of_droid_size_makes_no_call_per_episode_and_needs_50_mb(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, idle: dict[str, Any]
 ) -> None:
     kept, ranges = tmp_path / "table", tmp_path / "ranges"

@@ -35,7 +35,7 @@ def open_set(names: list[str] | None = None, **changes: Any) -> Dataset:
 
 
 def splits_of(dataset: Dataset) -> dict[str, str]:
-    """Return the split of every episode, by the clips that come from it."""
+    """Return the split of every episode, determined from the clips of each split."""
     return {
         dataset.table.identity(int(place)): split
         for split in ("train", "validation", "test")

@@ -49,13 +49,13 @@ def test_translation_rotation_or_gripper_motion_is_not_idle(number: int) -> None
 
 def test_idle_steps_are_detected_where_roll_wraps() -> None:
     states = resting(60, [(20, 40)])
-    states[20:40, 3] += np.where(np.arange(20) % 2, 2 * np.pi, 0)  # the same angle, written differently
+    states[20:40, 3] += np.where(np.arange(20) % 2, 2 * np.pi, 0)  # the same angle, plus 2 pi
     idle = idle_by_motion(states, MOTION)
     assert np.flatnonzero(idle).tolist() == list(range(20, 40))
     assert moving_ranges(idle, MOTION) == [(0, 10), (40, 50)]
 
 
-def test_short_idle_runs_are_kept_and_short_moves_removed() -> None:
+def test_short_idle_runs_are_not_removed_and_short_moves_are() -> None:
     def ranges(rests: list[tuple[int, int]], **options: Any) -> list[tuple[int, int]]:
         idle = np.zeros(80, bool)
         for start, end in rests:
@@ -73,7 +73,7 @@ def test_short_idle_runs_are_kept_and_short_moves_removed() -> None:
 
 @settings(max_examples=60)
 @given(idle=st.lists(st.booleans(), max_size=120))
-def test_kept_ranges_are_disjoint_and_contain_no_long_idle_run(idle: list[bool]) -> None:
+def test_selected_ranges_are_disjoint_and_contain_no_long_idle_run(idle: list[bool]) -> None:
     ranges = moving_ranges(np.array(idle, bool), MOTION)
     edges = [edge for pair in ranges for edge in pair]
     assert edges == sorted(set(edges))
@@ -82,7 +82,7 @@ def test_kept_ranges_are_disjoint_and_contain_no_long_idle_run(idle: list[bool])
         assert "1" * 7 not in "".join(str(int(one)) for one in idle[start:end])
 
 
-# The whole way: a data set is looked through once, and what was found is kept.
+# Data sets: the ranges are computed once and cached.
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def starts(dataset: Dataset) -> set[tuple[int, int]]:
     return {windows[index] for index in range(len(windows))}
 
 
-def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
+def test_clips_are_inside_the_selected_ranges(open_with: Any) -> None:
     dataset = open_with(source_with_rests(), idle=MOTION)
     assert [dataset.selected_steps.ranges_of(episode) for episode in range(3)] == [
         ((0, 10), (35, 50)),
@@ -150,7 +150,7 @@ def test_wrong_setting_stops_the_pass_after_ten_episodes(open_with: Any) -> None
     assert len(source.reads) <= 14
 
 
-# Ranges from a list that somebody published.
+# Ranges from a published list.
 
 
 def published(tmp_path: Path, content: object) -> dict[str, Any]:
@@ -168,7 +168,7 @@ def test_published_ranges_are_matched_by_identity(open_with: Any, tmp_path: Path
     assert source.reads == []
     assert starts(dataset) == {(1, start) for start in (*range(8), *range(20, 36))}
     other = open_with(source, **published(tmp_path, {"episode 1": [[0, 13]]}))
-    assert other.selected_steps.ranges_of(1) == ((0, 13),), "a changed list is read anew"
+    assert other.selected_steps.ranges_of(1) == ((0, 13),), "a changed list is read again"
     url = gcs.put("robots/ranges.json", json.dumps({"episode 1": [[0, 13]]}).encode())
     assert open_with(source, idle=IdleConfig(rule="published", ranges=url)).selected_steps.ranges_of(1) == ((0, 13),)
     with pytest.raises(InputError, match=r"nowhere\.json: cannot be read"):

@@ -62,7 +62,9 @@ def test_index_of_a_moved_folder_is_reused_with_updated_paths(tmp_path: Path) ->
     table = cached_table(tmp_path, index_key({"files": 3}, "/mnt/set"), "/mnt/set")
     assert [problem.where for problem in table.problems] == ["/mnt/set/a.npz: x"]
     others = [index_key({"files": 4}, "/data/set"), index_key({"files": 3}, "/data/set", identity="other/success")]
-    others += [index_key({"files": 3}, f"gs://{bucket}/set") for bucket in "ab"]  # servers say little of versions
+    others += [
+        index_key({"files": 3}, f"gs://{bucket}/set") for bucket in "ab"
+    ]  # the versions of remote files are less reliable
     assert len({KEY, *others}) == 5
 
 

@@ -118,7 +118,7 @@ def test_workers_exit_when_the_run_is_killed(droid: Path, tmp_path: Path) -> Non
         start_new_session=True,
     ) as run:
         try:
-            run.communicate(timeout=120)  # waits until no process holds the pipe any more
+            run.communicate(timeout=120)  # waits until all processes have closed the pipe
         except subprocess.TimeoutExpired:
             os.killpg(run.pid, signal.SIGKILL)
             pytest.fail("a worker outlives the run")
@@ -143,7 +143,7 @@ def test_frames_of_different_sizes_raise_in_collate(droid: Path) -> None:
     assert "broken_episodes" not in caught.value.fix, "that would not help"
 
 
-# Laws of the order, on episodes in memory: what is read can be counted.
+# Properties of the order, with episodes in memory, whose reads are counted.
 
 
 def first(dataset: Dataset, count: int, **options: Any) -> list[Batch]:
@@ -192,7 +192,7 @@ def test_camera_of_a_clip_depends_on_seed_and_position_only() -> None:
     assert 70 < drawn.count(CAMERAS[0]) < 130
 
 
-# Poses of the camera.
+# Camera poses.
 
 
 def test_camera_frame_poses_give_camera_frame_actions() -> None:
@@ -209,7 +209,7 @@ def test_camera_frame_poses_give_camera_frame_actions() -> None:
     assert np.allclose(clip.extrinsics, cameras[:3])
 
 
-# Clips that cannot be read.
+# Unreadable clips.
 
 
 def broken_set(broken: set[int], **options: Any) -> Dataset:
@@ -272,7 +272,7 @@ def test_remote_clips_are_read_concurrently() -> None:
 
     class Slow(MemorySource):
         def read(self, *arguments: Any) -> Episode:
-            meeting.wait()  # nobody gets on before four are here
+            meeting.wait()  # no thread continues before four have arrived
             return super().read(*arguments)
 
     dataset = open_in_memory(Slow([30] * 10))

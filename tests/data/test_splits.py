@@ -143,7 +143,7 @@ def test_lerobot_splits_are_ranges_of_episode_numbers(open_set: Opened, tmp_path
     ]  # fmt: skip
 
 
-def test_excluding_a_whole_own_split_raises_with_the_config_key(open_set: Opened, tmp_path: Path) -> None:
+def test_excluding_all_episodes_of_a_split_raises_with_the_config_key(open_set: Opened, tmp_path: Path) -> None:
     folder = write_rlds_splits(tmp_path / "set", "train", "val")
     held_out = [name for name, split in members(open_set(folder)).items() if split == "validation"]
     with pytest.raises(InputError, match=r"no validation episodes among 4 .*Set data\.splits: hash"):

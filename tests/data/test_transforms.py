@@ -49,7 +49,7 @@ def test_letterbox_keeps_all_pixels_between_black_bars(height: int, width: int) 
 
 @pytest.mark.parametrize("size", [(16, 20_000), (20_000, 16)])
 def test_letterbox_of_gigabytes_raises(size: tuple[int, int]) -> None:
-    with pytest.raises(InputError, match=r"data\.crop: letterbox: 1 images of 20000 x 20000 pixels"):
+    with pytest.raises(InputError, match=r"data\.crop: letterbox: 1 image of 20000 x 20000 pixels"):
         crop_frames(np.zeros((1, *size, 3), np.uint8), "letterbox")
 
 

@@ -38,7 +38,7 @@ def episodes(*lengths: int) -> list[EpisodeInfo]:
 
 
 def select_split_windows(infos: list[EpisodeInfo], config: DataConfig, split: Split) -> Windows:
-    """Return the windows of episodes whose steps are all kept."""
+    """Return the windows of episodes whose steps are all selected."""
     table = EpisodeTable.from_infos(infos)
     is_selected = select_included(table, config)
     starts = find_clip_windows(table, StepSelection.all_steps(table, is_selected), config)
@@ -55,7 +55,7 @@ def test_permutation_returns_each_index_once(size: int, seed: int, epoch: int) -
     assert sorted(permute_index(index, size=size, seed=seed, epoch=epoch) for index in range(size)) == list(range(size))
 
 
-def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> None:
+def test_clips_start_at_multiples_of_start_every_from_the_first_selected_step() -> None:
     table = EpisodeTable.from_infos([EpisodeInfo("a", 40), EpisodeInfo("b", 20)])
     kept = StepSelection(*(np.array(column, np.int32) for column in ([0, 0, 1], [3, 20, 0], [16, 31, 20])))
     config = settings_of(frames=3, stride=2, start_every=4)
@@ -130,7 +130,7 @@ def test_each_episode_is_in_one_split_and_no_split_with_a_share_is_empty(
         assert found["test"] > 0 or test == 0
 
 
-def test_larger_held_out_share_only_takes_episodes_from_train() -> None:
+def test_larger_held_out_share_only_moves_episodes_out_of_train() -> None:
     hashes = [number * 2**54 for number in range(1024)]
     before, after = (
         {split: draw_split(np.array(hashes, np.uint64), settings_of(validation_share=share, test_share=0.05), split)
@@ -154,7 +154,7 @@ def splits_of(source: MemorySource, **options: object) -> dict[str, Split]:
 
 @pytest.mark.parametrize("split_by", [None, r"episode (\d)"])
 @pytest.mark.parametrize("left_out", [0, 2, 6, 7])
-def test_excluding_an_episode_moves_no_other_between_splits(left_out: int, split_by: str | None) -> None:
+def test_excluding_an_episode_keeps_the_splits_of_the_others(left_out: int, split_by: str | None) -> None:
     """Excluded or broken episodes do not move training episodes into validation."""
     options = {"split_by": split_by, "idle": {"rule": "motion"}, "broken_episodes": "skip"}
     before = splits_of(MemorySource([60] * 8), **options)

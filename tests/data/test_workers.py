@@ -53,7 +53,7 @@ def test_shared_memory_smaller_than_all_batches_raises(shared_memory: Any, worke
     require_shared_memory(data(0), 1000, processes)
 
 
-def test_a_system_without_shared_memory_is_not_checked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_shared_memory_check_is_skipped_without_shared_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(loader, "SHARED_MEMORY", tmp_path / "none")
     require_shared_memory(data(4), 10**18)
 

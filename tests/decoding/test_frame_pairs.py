@@ -79,14 +79,14 @@ def test_unencoded_episode_is_skipped_and_damaged_file_raises(
         rest.read(range(len(rest)))
 
 
-# ---- the linear decoder and the measures ----
+# ---- the linear decoder and the metrics ----
 
 SHAPE = DecoderShape("tiny", dim=12, grid=2, patch_size=8)
 
 
 @dataclass
 class Linear:
-    """Pairs whose images are linear in their latents, up to the rounding to 8 bits."""
+    """Pairs whose images are linear functions of their latents, up to the rounding to 8 bits."""
 
     frames: int = 150
 
@@ -122,9 +122,9 @@ def test_linear_fit_recovers_a_linear_decoder() -> None:
 
 
 def test_exact_frames_are_counted_and_excluded_from_psnr() -> None:
-    """Its PSNR is infinite, and so would be the mean, which JSON cannot hold."""
+    """The PSNR of an exact frame is infinite, and JSON cannot represent an infinite mean over all frames."""
     pairs, black = Linear(frames=9), torch.zeros(3, 16, 16)
-    pairs.images[:2] = 0  # as the mean image shows them
+    pairs.images[:2] = 0  # equal to the mean image
     pairs.images[2:] = 51
     found = measure_decoders(pairs, {"decoder": pairs.truth}, black, no_progress)["mean_image"]  # type: ignore[arg-type]
     assert found["exact_frames"] == 2

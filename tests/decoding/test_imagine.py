@@ -20,7 +20,7 @@ STATE = np.array([0.4, 0.1, 0.3, 3.1, 0.0, -3.1, 0.9])
 
 
 class RecordingModel:
-    """A model that answers with the first frame, and remembers what it was given."""
+    """A model that predicts the first frame again, and records its inputs."""
 
     def rollout(self, context: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
         self.given = context, actions, states, extrinsics

@@ -34,10 +34,12 @@ def assert_same_decoder(one: Path, other: Path) -> None:
     assert read_card(one).held_out == read_card(other).held_out
     rows = [list(read_metrics_log(folder / "metrics.jsonl")) for folder in (one, other)]
     assert rows[0] == rows[1]
-    assert {path.name for path in other.iterdir() if path.suffix != ".partial"} == FINISHED  # of what was killed
+    assert {
+        path.name for path in other.iterdir() if path.suffix != ".partial"
+    } == FINISHED  # partial files of the killed process
 
 
-# ---- what it learns ------------------------------------------------------------------------------------------------
+# ---- learning ------------------------------------------------------------------------------------------------------
 
 
 def test_decoder_memorises_four_frames(make_decoder: MakeConfig, encode_split: EncodeSplit) -> None:
@@ -47,7 +49,7 @@ def test_decoder_memorises_four_frames(make_decoder: MakeConfig, encode_split: E
     assert psnr(decoder.decode(pairs.latents), to_images(pairs.images)).min() > 30
 
 
-# ---- whatever happens ----------------------------------------------------------------------------------------------
+# ---- interruptions -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("default_signals")
@@ -98,7 +100,7 @@ def test_leftovers_in_a_finished_folder_are_removed_and_check_writes_nothing(
     assert {path.name for path in (tmp_path / "decoder").iterdir()} == FINISHED
 
 
-# ---- what is refused -----------------------------------------------------------------------------------------------
+# ---- errors --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def equal(one: list[torch.Tensor], other: list[torch.Tensor]) -> bool:
     return len(one) == len(other) > 0 and all(map(torch.equal, one, other))
 
 
-# ---- written, found and read -------------------------------------------------------------------------------------
+# ---- writing and reading -----------------------------------------------------------------------------------------
 
 
 def test_second_machine_completes_a_cache_in_a_bucket(
@@ -117,7 +117,7 @@ def test_run_on_a_bucket_cache_equals_run_on_a_local_cache_bit_for_bit(
     assert sum(encoded_frames) == 2 * EPISODES * 24
 
 
-def test_bucket_cache_takes_one_listing_and_reads_each_range_once(
+def test_bucket_cache_needs_one_listing_and_reads_each_range_once(
     bucket: Gcs, bucket_config: Callable[..., Config]
 ) -> None:
     options = {"data__start_every": 2, "data__frames": 8}
@@ -138,7 +138,7 @@ def test_bucket_cache_takes_one_listing_and_reads_each_range_once(
     assert not bucket.reads(".safetensors"), "all from this machine's disk"
 
 
-# ---- what can fail -----------------------------------------------------------------------------------------------
+# ---- failures ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_damaged_bucket_file_is_reported_and_encoded_again(
     assert equal(batches(open_cache_only(bucket_config(), folder)), expected)
 
 
-# ---- several processes, and their death --------------------------------------------------------------------------
+# ---- several and killed processes -------------------------------------------------------------------------------
 
 
 def start(nursery: Nursery, config: Config, folder: Path, name: str, **environment: str) -> object:
@@ -205,7 +205,7 @@ def test_killed_upload_leaves_no_finished_file(
     encoded_frames.clear()
     bucket.fail_next("hang", times=ALWAYS, match=r"POST /upload/.*00000[3-7]-")
     child = start(nursery, bucket_config("two"), tmp_path, "killed")
-    while bucket.faults_left == ALWAYS or len(latents_in(bucket)) < 3:  # the fourth upload is under way
+    while bucket.faults_left == ALWAYS or len(latents_in(bucket)) < 3:  # during the fourth upload
         assert child.is_running()
         time.sleep(0.01)
     assert child.kill() == KILLED

@@ -44,7 +44,7 @@ def test_each_needed_frame_is_encoded_once(
     reported: list[tuple[int, int]] = []
     found = encode(config, tmp_path / "out", lambda *of: reported.append(of), reporter)
     frames = needed(config)
-    assert frames == 8 * 12  # of 24 steps every second one
+    assert frames == 8 * 12  # every second of 24 steps
     assert sum(encoded_frames) == frames
     assert (0, frames) in reported
     assert reported[-1] == (frames, frames)
@@ -56,7 +56,7 @@ def test_each_needed_frame_is_encoded_once(
     assert not encoded_frames
 
 
-# ---- whatever happens --------------------------------------------------------------------------------------------
+# ---- interruptions -----------------------------------------------------------------------------------------------
 
 
 def test_kill_loses_at_most_one_episode(
@@ -231,7 +231,7 @@ def test_run_with_cached_latents_equals_run_on_frames_bit_for_bit(
     cached = {"data__cache": "auto", "data__cache_dtype": "fp32", "data__cache_dir": str(cache)}
     config = make_config(run_dir=str(tmp_path / "latents"), **cached)
     latents = train(config, reporter)
-    assert sum(encoded_frames) == needed(config)  # and not one in training
+    assert sum(encoded_frames) == needed(config)  # and none in training
     assert_same_run(whole_run, latents)
     encoded_frames.clear()
     assert_same_run(whole_run, train(make_config(run_dir=str(tmp_path / "again"), **cached), reporter))

@@ -194,7 +194,7 @@ EVERYTHING = {
 
 @pytest.fixture(scope="module")
 def droid_with_rests(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Sixteen episodes of 12 to 27 steps, with some standstill."""
+    """Sixteen episodes of 12 to 27 steps, some of them idle."""
     drawn = []
     for number in range(16):
         one = synthetic_episode(number, steps=12 + number, size=(36, 64), success=number % 3 != 2)
@@ -235,7 +235,7 @@ def first_batches(dataset: Dataset, count: int = 6) -> list[Batch]:
 
 
 def assert_same_clips(original: list[Batch], cached: list[Batch]) -> None:
-    """The states, actions and frames of each clip are those of the original."""
+    """Check that the states, actions and frames of each clip equal those of the original."""
     assert len(original) == len(cached)
     for one, other in zip(original, cached, strict=True):
         assert one.frames is not None
@@ -307,7 +307,7 @@ def test_damaged_cache_file_follows_the_broken_episode_policy(cached_set_with_br
     write_cache(opened("error"))
     files = LatentCache.for_dataset(opened("error"), NUMBERS).files
     path = Path(files.path(7, "exterior_1_left"))
-    changed(path, lambda tensors, _: tensors.pop("states"))  # found when it is read
+    changed(path, lambda tensors, _: tensors.pop("states"))  # detected on reading
     with pytest.raises(InputError, match=r"000007.*data\.broken_episodes"):
         list(
             read_batches(
@@ -317,12 +317,12 @@ def test_damaged_cache_file_follows_the_broken_episode_policy(cached_set_with_br
     through = LatentCache.for_dataset(opened("skip"), NUMBERS).open_dataset()
     assert len(list(read_batches(through, [(6, 0), (7, 0)], batch_size=1))) == 1
     assert list(through.broken.reasons) == ["episode 7"]
-    path.unlink()  # found when the cache is opened
+    path.unlink()  # detected when the cache is opened
     with pytest.raises(InputError, match=r"no latents of 1 of 100 episodes, such as episode 7"):
         LatentCache.for_dataset(opened("skip"), NUMBERS).open_dataset()
 
 
-# ---- what is refused ---------------------------------------------------------------------------------------------
+# ---- errors ------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

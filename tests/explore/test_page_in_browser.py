@@ -112,7 +112,7 @@ def test_all_functions_are_available_by_keys(live: Views, open_page: Any) -> Non
         assert not re.findall("undefined|NaN|\\[object", page.locator("body").inner_text())
 
 
-def test_keys_command_no_motion_while_a_number_is_typed(live: Views, open_page: Any) -> None:
+def test_typing_a_number_commands_no_motion(live: Views, open_page: Any) -> None:
     with serving(live) as url:
         page = open_page(url)
         role(page, "goal").locator("summary").first.click()

@@ -54,7 +54,7 @@ def test_goals_command_selects_gripper_key_frames(
     assert str(tmp_path / "goals/goals.json") in printed
 
 
-def test_goals_command_accepts_name_or_number_and_takes_every_nth_frame(workshop: Path, tmp_path: Path) -> None:
+def test_goals_command_accepts_name_or_number_and_selects_every_nth_frame(workshop: Path, tmp_path: Path) -> None:
     _, numbered = goals(workshop, tmp_path / "a", "--episode", "1", "--every", "10", "data.stride=5")
     name = numbered["origin"]["episode"]
     _, named = goals(workshop, tmp_path / "b", "--episode", name, "--every", "10", "data.stride=5")
@@ -113,7 +113,7 @@ def test_invalid_input_prints_one_line_and_writes_nothing(
     assert not list(tmp_path.iterdir())
 
 
-def test_plan_command_takes_its_goal_from_an_episode(whole_run: Path, data_folder: Path, tmp_path: Path) -> None:
+def test_plan_command_reads_its_goal_from_an_episode(whole_run: Path, data_folder: Path, tmp_path: Path) -> None:
     dataset = open_dataset(data_folder, frames=4, stride=2)
     last, third = dataset.source.read(1).read_frames([len(dataset.source.read(1).states) - 1, 3])
     Image.fromarray(third).save(tmp_path / "third.png")

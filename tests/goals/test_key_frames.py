@@ -17,7 +17,7 @@ from vjepa2_ac.goals.key_frames import (
 
 
 def make_states(*parts: tuple[int, float, float]) -> np.ndarray:
-    """Return states: so many frames each, along which x changes by metres and the gripper by closedness, evenly."""
+    """Return states of parts (number of frames, change of x in metres, change of closedness), linear within a part."""
     x, grip = [0.4], [0.0]
     for frames, metres, closes in parts:
         x += (x[-1] + metres * np.arange(1, frames + 1) / frames).tolist()
@@ -67,7 +67,7 @@ def test_key_frames_are_gripper_changes_and_stops(parts: tuple, keys: list) -> N
 )
 def test_key_frames_are_ascending_few_and_exclude_the_start(parts: list) -> None:
     states = make_states(*parts)
-    states[:, 6] = np.abs((states[:, 6] + 1) % 2 - 1)  # to and fro between 0 and 1
+    states[:, 6] = np.abs((states[:, 6] + 1) % 2 - 1)  # alternating between 0 and 1
     for rule in (None, MODEL_STEP_RULE):
         frames = [key.frame for key in find_gripper_key_frames(states, rule)]
         assert frames == sorted(set(frames))

@@ -50,7 +50,7 @@ def test_pose_recognised_by_width_is_a_guess(columns: dict[str, int], rotation: 
         {"action": Column(7, ("x", "y", "z", "roll", "pitch", "yaw", "gripper"))},
     ],
 )
-def test_joints_and_commands_are_not_taken_for_a_pose(columns: dict[str, Column]) -> None:
+def test_joints_and_commands_are_not_recognised_as_a_pose(columns: dict[str, Column]) -> None:
     assert find_pose(columns) is None
 
 

@@ -125,7 +125,9 @@ def test_videos_and_tables_become_episodes(
     with np.load(tmp_path / "npz/first.npz") as file:
         assert file["frames"].shape == (STEPS, 32, 48, 3)
         smaller = [np.asarray(Image.fromarray(frame).resize((48, 32))) for frame in FRAMES]
-        assert np.abs(file["frames"] - np.stack(smaller).astype(float)).mean() < 12  # of 255: a codec and two resizers
+        assert (
+            np.abs(file["frames"] - np.stack(smaller).astype(float)).mean() < 12
+        )  # of 255, because of a codec and two resizers
 
 
 def drop_table(folder: Path) -> None:

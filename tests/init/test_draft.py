@@ -24,7 +24,7 @@ MACHINE = Machine("NVIDIA GeForce RTX 3090", 24 * GB, has_bf16=True, cores=8, fr
 
 @pytest.fixture(autouse=True)
 def memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Count 4 GB and 2 GB a clip, 0.5 with checkpointing, instead of five seconds of fake tensors."""
+    """Replace the memory estimate, which takes 5 s: 4 GB plus 2 GB per clip, or 0.5 GB with checkpointing."""
 
     def estimate(config: Config, _sizes: object) -> SimpleNamespace:
         clips = config.training.batch_size
@@ -131,7 +131,7 @@ def test_stride_gives_droids_model_step_and_clips_fit_into_most_episodes() -> No
     assert (data.stride, data.frames) == (8, 8)
     short = make(replace(PROPERTIES, median_steps=60, p10_steps=40)).config.data
     assert short.clip_steps <= 40
-    assert short.idle.rule == "none"  # too short to cut pauses out
+    assert short.idle.rule == "none"  # too short for the idle filter
 
 
 def test_small_data_set_gets_fewer_steps_and_larger_held_out_shares() -> None:

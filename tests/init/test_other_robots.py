@@ -90,7 +90,7 @@ def test_rotation_format_is_recognised(names: str, rotation: str, is_guess: bool
         ("x y z wx wy wz gripper", "euler_xyz", "euler_xyz"),
     ],
 )
-def test_values_that_contradict_column_names_decide_as_a_guess(names: str, rotation: str, other: str) -> None:
+def test_values_override_contradicting_column_names_as_a_guess(names: str, rotation: str, other: str) -> None:
     numbers = [convert_states(states, rotation) for states in EPISODES]
     pose = propose_pose(names, numbers)
     assert (pose["rotation"].value, pose["rotation"].is_guess) == (other, True)
@@ -125,7 +125,7 @@ def test_degrees_and_millimetres_are_recognised_by_magnitude() -> None:
     assert max_rotation_error_deg(pose, numbers[0], EPISODES[0]) < 0.1
 
 
-def test_guess_without_sampled_values_says_that_values_were_not_read() -> None:
+def test_guess_without_sampled_values_states_that_values_were_not_read() -> None:
     rotation = propose_pose("x y z rot_x rot_y rot_z gripper", None)["rotation"]
     assert rotation.is_guess
     assert "rotation_vector" in rotation.reason
@@ -238,7 +238,7 @@ def chosen_names(names: str) -> list[str]:
         ("j0 j1 x y z qx qy qz qw finger_joint", "x y z qx qy qz qw finger_joint"),
     ],
 )
-def test_other_quantities_are_not_taken_for_the_pose(names: str, expected: str) -> None:
+def test_other_quantities_are_not_recognised_as_the_pose(names: str, expected: str) -> None:
     assert chosen_names(names) == expected.split()
 
 
@@ -262,7 +262,7 @@ def test_measured_end_effector_pose_is_preferred(columns: list[str], chosen: int
 
 
 @pytest.mark.parametrize("name", ["object_pose", "camera_pose", "head_pose", "cube_pose"])
-def test_pose_of_an_object_is_not_taken_for_the_robot(name: str) -> None:
+def test_pose_of_an_object_is_not_recognised_as_the_robots(name: str) -> None:
     assert find_pose({f"observation.{name}": Column(6), "observation.gripper": Column(1)}) is None
 
 

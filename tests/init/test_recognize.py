@@ -118,7 +118,7 @@ def test_depth_maps_are_not_offered_as_cameras(tmp_path: Path) -> None:
         read_properties(str(folder))
 
 
-def test_data_set_with_droids_schema_is_droid_only_by_name(tmp_path: Path) -> None:
+def test_data_set_with_the_schema_of_droid_is_droid_only_with_its_name(tmp_path: Path) -> None:
     folder = WRITERS["rlds"](tmp_path / "bridge/1.0.0", range(3))
     for name in ("r2d2_faceblur", "droid_101"):
         data, guessed, text = make_draft_of(rename_dataset(folder, name))

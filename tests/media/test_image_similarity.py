@@ -74,7 +74,7 @@ def test_gradients_are_finite_where_a_factor_is_zero() -> None:
     assert torch.isfinite(gradient).all()
 
 
-def test_autocast_changes_nothing() -> None:
+def test_metrics_are_unchanged_under_autocast() -> None:
     predicted, true = pair(1, (48, 48))
     with torch.autocast("cpu", dtype=torch.bfloat16):
         inside = [measure(predicted, true) for measure in (psnr, ssim, ms_ssim_of_3)]

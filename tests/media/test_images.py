@@ -117,7 +117,7 @@ def test_all_formats_reject_images_above_the_limit(tmp_path: Path, form: str, mo
 
 
 def tagged(pixels: np.ndarray, orientation: object, form: str) -> bytes:
-    """Return an image file whose EXIF data have an orientation."""
+    """Return an image file with an EXIF orientation."""
     exif, file = Image.Exif(), io.BytesIO()
     exif[0x0112] = orientation
     options = {"quality": 98, "subsampling": 0} if form == "JPEG" else {}

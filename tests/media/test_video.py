@@ -39,17 +39,17 @@ def test_requested_frames_equal_those_of_a_full_decode(tmp_path: Path, gop: int,
 
 
 def test_open_gop_is_decoded_from_a_valid_key_frame(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """x265's key frames are preceded by frames that are stored after them."""
+    """With x265, some frames that are displayed before a key frame are stored after it."""
     path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=12, codec="libx265")
     frames = every_frame(path)
-    capfd.readouterr()  # what the encoder says
+    capfd.readouterr()  # discards the output of the encoder
     for step in range(STEPS):
         np.testing.assert_array_equal(read_frames(path, [step], where="a")[0], frames[step])
         np.testing.assert_array_equal(read_frames(path, [step], where="a", clock=Clock(0.0, 15.0))[0], frames[step])
 
 
 def test_av1_is_decoded() -> None:
-    path = GOLDEN / "av1.mp4"  # not encoded here: as root, SVT-AV1 takes the processor from all others (SCHED_FIFO)
+    path = GOLDEN / "av1.mp4"  # a stored file, because SVT-AV1 run by root blocks all other processes (SCHED_FIFO)
     np.testing.assert_array_equal(read_frames(path, [19, 4, 3], where="a"), every_frame(path)[[19, 4, 3]])
 
 
@@ -61,7 +61,7 @@ def test_depth_video_raises(codec: str, pixels: str, tmp_path: Path, capfd: pyte
         for _ in range(3):
             file.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 64), 900, np.uint16), format=pixels)))
         file.mux(stream.encode(None))
-    capfd.readouterr()  # what the encoder says
+    capfd.readouterr()  # discards the output of the encoder
     with pytest.raises(InputError, match=f"a: frames of {pixels}: one channel of more than 8 bits, as in depth videos"):
         read_frames(path, [0], where="a")
 
@@ -135,7 +135,7 @@ def test_header_gives_frame_count_and_rate_without_gaps(tmp_path: Path) -> None:
     assert read_header(write_mp4(tmp_path / "a.mp4", FRAMES[:1]), where="a").rate_hz == 0
 
 
-MATRICES = {  # a, b, c, d of the header's matrix, and what is displayed
+MATRICES = {  # a, b, c, d of the header's matrix, and the displayed image
     "rotated by 90 degrees": ((0, 1, -1, 0), lambda image: np.rot90(image, -1)),
     "rotated by 180 degrees": ((-1, 0, 0, -1), lambda image: np.rot90(image, 2)),
     "rotated by 270 degrees": ((0, -1, 1, 0), np.rot90),
@@ -226,7 +226,7 @@ def cut(data: bytes, share: float) -> bytes:
 
 
 def blanked(data: bytes) -> bytes:
-    """A stretch of zeros in the middle of the frames."""
+    """Replace a part in the middle of the file by zeros."""
     start = data.index(b"mdat") + 4000
     return data[:start] + bytes(3000) + data[start + 3000 :]
 
@@ -263,7 +263,7 @@ def test_frame_past_the_end_raises(tmp_path: Path, clock: Clock | None) -> None:
 
 def test_reordered_frames_without_header_information_are_found_by_time(tmp_path: Path) -> None:
     """Frames of a file with key frames only may be displayed in another order than they are stored."""
-    shown = [1, 3, 2, 5, 4, 7, 6, 8]  # when each stored picture is shown
+    shown = [1, 3, 2, 5, 4, 7, 6, 8]  # presentation time of each stored frame
     whole = every_frame(write_mp4(tmp_path / "whole.mp4", FRAMES[:8], gop=1))
     with av.open(str(tmp_path / "whole.mp4")) as source, av.open(str(tmp_path / "moved.mp4"), "w") as target:
         stream = target.add_stream_from_template(source.streams.video[0])
@@ -302,7 +302,7 @@ def test_written_video_reads_back(tmp_path: Path) -> None:
     path = write_video(tmp_path / "new" / "film.mp4", iter(made), rate_hz=3.75)
     assert read_header(path, where="film").num_frames == 5
     shown = read_frames(path, range(5), where="film")
-    assert shown.shape == (5, 32, 48, 3)  # an odd row is left out
+    assert shown.shape == (5, 32, 48, 3)  # an odd row is dropped
     for ours, theirs in zip(made, shown, strict=True):
         np.testing.assert_allclose(theirs.mean(axis=(0, 1)), ours[:32].mean(axis=(0, 1)), atol=6)
     with av.open(str(path)) as file:

@@ -47,7 +47,7 @@ def write_axes(path: Path, model: WorldModel, degrees: float = 43.0, **changes: 
 
 
 def test_rotated_actions_lead_to_rotated_states() -> None:
-    """What the model sees is a world like the robot's, only turned: acting and turning can be done in either order."""
+    """Rotating the result of an action equals applying the rotated action to the rotated state."""
     states, tried = random_numbers(50, 7), random_numbers(50, 7, seed=1) - 0.4
     torch.testing.assert_close(
         apply_actions(TURN.rotate_poses(states), TURN.rotate_actions(tried)),
@@ -82,7 +82,7 @@ def test_energy_with_axes_equals_energy_of_rotated_actions_and_states(extrinsics
 
 
 def test_limits_apply_to_executed_actions_with_calibrated_axes(tmp_path: Path) -> None:
-    """Limits of a long thin box: turned by 43 degrees they would be exceeded."""
+    """The limits form a long thin box; actions rotated by 43 degrees would exceed them."""
     model = tiny_model()
     limits = LimitsConfig(xyz=(0.05, 0.002, 0.05))
     plans = []

@@ -31,7 +31,7 @@ def controller() -> Controller:
 
 
 def why(run: Controller, frame: np.ndarray, state: np.ndarray = STATE) -> str:
-    """Return the reason of a decision, which is to do nothing where the frame cannot be used."""
+    """Return the reason of a decision; check that the action is zero for a faulty frame."""
     action = run.act(frame, state)
     assert action.any() == (run.decision.why in {"planned", "as planned"})
     return run.decision.why

@@ -119,7 +119,7 @@ def test_mask_is_cropped_like_the_image_and_weights_patches() -> None:
     run.reset(image(100), mask=mask)
     assert run._patch_weights.nonzero().flatten().tolist() == [0]
     mask = np.zeros((48, 120), bool)
-    mask[:16, :20] = True  # outside what the model sees: columns 27 to 91
+    mask[:16, :20] = True  # outside the crop, which is columns 27 to 91
     mask[:16, 72:] = True
     run.reset(image(100, 48, 120), mask=mask)
     assert run._patch_weights.nonzero().flatten().tolist() == [2]

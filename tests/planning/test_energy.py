@@ -23,7 +23,7 @@ from vjepa2_ac.spaces import Spaces, apply_action
 
 @torch.no_grad()
 def plain_predictions(model: WorldModel, start: Scene, tried: Tensor) -> Tensor:
-    """Compute everything again for each prediction of one sample, poses by NumPy."""
+    """Return the predictions of a single sample without a cache, with poses computed by NumPy."""
     states = [start.state.double().numpy()]
     for action in tried.double().numpy():
         after = apply_action(states[-1], action)
@@ -51,7 +51,7 @@ def test_rollout_equals_a_plain_implementation(adapted: bool, extrinsics: bool) 
     expected = torch.stack([plain_predictions(model, start, one) for one in tried])
     torch.testing.assert_close(found, expected, rtol=2e-5, atol=2e-5)
     assert states.shape == (3, 4, 7)
-    assert (found[0] - found[1]).abs().mean() > 1e-3  # it heeds its actions
+    assert (found[0] - found[1]).abs().mean() > 1e-3  # the predictions depend on the actions
 
 
 @torch.no_grad()
@@ -85,10 +85,12 @@ def test_predictor_batches_are_at_most_samples_at_once() -> None:
     assert seen == [3, 3, 1]
     seen.clear()
     tried = actions(7, 1).requires_grad_()
-    cost(model, samples_at_once=7)(tried).sum().backward()  # one part is not computed again
+    cost(model, samples_at_once=7)(tried).sum().backward()  # a single part is not recomputed
     assert seen == [7]
     seen.clear()
-    cost(model, samples_at_once=4)(tried).sum().backward()  # several are, so that one at a time is in memory
+    cost(model, samples_at_once=4)(
+        tried
+    ).sum().backward()  # several parts are recomputed, so that one part at a time is in memory
     assert sorted(seen) == [3, 3, 4, 4]
 
 
@@ -170,14 +172,14 @@ def test_energy_class_is_constructed_once_per_controller(monkeypatch: pytest.Mon
     assert len(made) == 1
 
 
-# Slices
+# Energy slices
 
 CHOSEN = torch.arange(28.0).reshape(4, 7) / 1000
 LIMITS = LimitsConfig(xyz=(0.04, 0.08, 0.0))
 
 
 def weighted(actions: Tensor) -> Tensor:
-    """Return a cost in which every number of every step counts by itself."""
+    """Return a cost with a different weight for each number of each step."""
     return (actions * torch.arange(1.0, 29.0).reshape(4, 7)).sum(dim=(1, 2))
 
 
@@ -200,14 +202,16 @@ def test_energy_slice_exceeds_the_limits_along_fixed_axes_too() -> None:
     )
     np.testing.assert_allclose(slices[0].across, [-0.05, 0, 0.05], rtol=1e-5)
     np.testing.assert_allclose(slices[0].up, [-0.1, 0, 0.1], rtol=1e-5)
-    np.testing.assert_allclose(slices[2].up, [-0.1, 0, 0.1], rtol=1e-5)  # dz is held: as wide as the widest
+    np.testing.assert_allclose(
+        slices[2].up, [-0.1, 0, 0.1], rtol=1e-5
+    )  # dz is fixed: the slice is as wide as the widest other one
     held = make_pose_search_space(PlanningConfig(horizon=4, limits=LimitsConfig(xyz=(0, 0, 0), rotation=0.1)))
     np.testing.assert_allclose(
         compute_energy_slices(weighted, CHOSEN, held, nodes=3)[0].up, [-0.0625, 0, 0.0625], rtol=1e-5
     )
 
 
-# Waiting
+# Synchronisation with the device
 
 ASKING = {
     "_local_scalar_dense", "_to_copy", "copy_", "equal", "index", "index_put_", "is_nonzero", "lift_fresh",
@@ -229,7 +233,7 @@ class OperationRecorder(TorchDispatchMode):
 
 
 def record_operations(work: Callable[[], object]) -> set[str]:
-    """Return what runs in something that was done once before."""
+    """Return the names of the operations that a call runs, after a first call as warm-up."""
     work()
     with OperationRecorder() as recorder:
         work()

@@ -24,13 +24,13 @@ def controller(**changes: object) -> Controller:
 
 
 def noisy_image(seed: int, most: int = 6) -> np.ndarray:
-    """Return an image as a camera with noise sees it."""
+    """Return an image with the noise of a camera."""
     noise = np.random.default_rng(99).integers(-most, most + 1, (60, 48, 3))
     return (image(seed) + noise).clip(0, 255).astype(np.uint8)
 
 
 def decide(run: Controller, seen: np.ndarray) -> tuple[int, int, bool, bool]:
-    """Return which goal applies, since when, whether it changed, and whether all is done."""
+    """Return the goal that applies, its start step, whether it changed, and whether the last goal is reached."""
     run.act(seen, STATE)
     return (
         run.decision.progress.goal_index,
@@ -135,7 +135,7 @@ def test_gripper_mode_without_gripper_or_free_component_raises() -> None:
 
 
 def sub_goal(*given: object, **named: object) -> SubGoal:
-    """Return a goal of which only the rule counts."""
+    """Return a goal with a rule; the image is arbitrary."""
     return SubGoal(np.zeros(0), *given, **named)
 
 
@@ -153,7 +153,7 @@ bounds = st.tuples(st.integers(1, 4), st.integers(0, 4))
 
 @st.composite
 def goal_sequences(draw: st.DrawFn) -> tuple[list[SubGoal], list[list[float]]]:
-    """Rules of some goals, and the energies of as many images as they need at most, and more."""
+    """Draw rules of some goals, and energies of more images than the goals need at most."""
     some = draw(st.lists(st.tuples(bounds, st.none() | st.floats(0.05, 0.95)), min_size=1, max_size=4))
     rules = [sub_goal("", low, low + more, share) for (low, more), share in some]
     rules.append(sub_goal(share=draw(st.none() | st.floats(0.05, 0.95))))

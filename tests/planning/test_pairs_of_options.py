@@ -35,7 +35,7 @@ def planner(name: str, **options: Any) -> dict[str, Any]:
 
 SIDE = 16  # pixels of a view: the model scales every image
 BASE: dict[str, Any] = {"horizon": 2, "samples": 4, "iterations": 1, "planner": planner("cem")}
-# Another value than the default's or that of BASE, for every key; with the keys that it needs.
+# For every key, a value other than the default and that of BASE, with the keys that it requires.
 OTHERS: dict[str, Any] = {
     "planner": {"planner": planner("icem")},
     "horizon": 4,
@@ -60,7 +60,7 @@ OTHERS: dict[str, Any] = {
     "energy.steps": "sum",
     "energy.samples_at_once": 3,
 }
-# Other planners with their options, what a caller gives along with a frame, and a planner that needs another option.
+# Other planners with their options, inputs that a caller passes with a frame, and a planner that needs an option.
 MORE: dict[str, Any] = {
     **{
         f"{name}.{option}": {"planner": planner(name, **{option: value})}
@@ -78,7 +78,7 @@ MORE: dict[str, Any] = {
     "mask": {},
     "samples of a policy": {},
 }
-# Options without which a decision does more: their pairs are tried one by one, those of all others a few at a time.
+# Options that skip parts of a decision: their pairs are tested separately, and other pairs in groups.
 ALONE = {"budget_s", "samples of a policy"}
 REFUSED = {
     *(frozenset({"views", other}) for other in ("axes", "prior", "planner=prior", "monitor")),
@@ -88,13 +88,13 @@ REFUSED = {
 
 @dataclass
 class Scene:
-    """The files and objects that all pairs share."""
+    """The files and objects that the tests of all pairs share."""
 
     model: WorldModel
     files: dict[str, str]
 
     def planning(self, *names: str) -> dict[str, Any]:
-        """Return the values of some options, each with what it needs."""
+        """Return the values of some options, with the keys that they require."""
         planning: dict[str, Any] = {}
         for key, value in [*BASE.items(), *(pair for name in names for pair in entries(name).items())]:
             section, _, inner = key.rpartition(".")
@@ -105,7 +105,7 @@ class Scene:
         """Return the config with some options.
 
         Raises:
-            InputError: They exclude one another.
+            InputError: The options exclude each other.
         """
         planning = self.planning(*names)
         try:  # quick
@@ -145,7 +145,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
 
 
 def plan_with_options(scene: Scene, *names: str) -> None:
-    """Take options through two decisions, `plan` and `score`."""
+    """Make two decisions with some options, and run `plan` and `score`."""
     config = scene.config(*names)
     planning, controller = config.planning, Controller.of_subject(Subject("tiny", config, scene.model))
     images = [image(seed, SIDE, SIDE * planning.views) for seed in range(4)]
@@ -192,7 +192,7 @@ def test_every_pair_of_options_works_or_raises_before_the_first_decision(scene: 
 
 
 def covering(left: list[frozenset[str]], together: dict[str, set[str]], at_most: int = 8) -> Iterator[list[str]]:
-    """Yield groups of options that go together and cover these pairs."""
+    """Yield groups of compatible options that cover these pairs."""
     while left:
         group = sorted(left[0])
         names = {name for pair in left for name in pair}

@@ -101,7 +101,7 @@ VECTORS = {
 
 
 def test_vector_run_plans_within_the_motions_of_its_data(make_config, reporter) -> None:
-    """Joint angles and a gripper: as many numbers as the data have, and no number changes more than it was taught."""
+    """The states are joint angles and a gripper. No number changes more than in the training data."""
     folder = train(make_config(**VECTORS, training__steps=1), reporter)
     data_changes = json.loads((folder / "changes.json").read_text())["changes"]
     states = [episode.states for episode in episodes_of(folder)]
@@ -165,7 +165,7 @@ CHANGES_IN_DATA = [0.03, 0.02, 0.01, 0.0, 0.1, 0.2, 0.8]  # metres, radians, clo
 
 @pytest.fixture
 def run_with_data_limits(make_config) -> Path:
-    """Return a run that was taught so, within the default gripper's limits."""
+    """Return a run with recorded motions and the default limits of the gripper."""
     folder = write_adapted_run(make_config(planning=PLANNING))
     write_changes(folder)
     return folder

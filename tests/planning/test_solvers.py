@@ -33,7 +33,7 @@ def space(decisions: int = 1, dim: int = 2, reach: float = 1.0) -> SearchSpace:
 def config(
     planner: str, iterations: int = 30, samples: int = 200, options: dict[str, Any] | None = None, **changes: Any
 ) -> PlanningConfig:
-    """Return settings that are good enough for a few numbers."""
+    """Return settings that suffice to optimise a few numbers."""
     usual = {"gradient": {"starts": 16, "learning_rate": 0.1}, "mppi": {"std_decay": 0.85}}.get(planner, {})
     component = {"name": planner, "options": options or usual}
     return PlanningConfig(planner=component, iterations=iterations, samples=samples, **changes)
@@ -51,7 +51,7 @@ def parabola(target: Tensor) -> Callable[[Tensor], Tensor]:
 
 
 def rosenbrock(actions: Tensor) -> Tensor:
-    """Return a bent valley; its lowest place is (1, 1), here at (0.5, 0.5)."""
+    """Return the Rosenbrock function of doubled actions, whose minimum is at (0.5, 0.5)."""
     x, y = (2 * actions[:, 0]).unbind(-1)
     return (1 - x) ** 2 + 100 * (y - x**2) ** 2
 
@@ -94,7 +94,7 @@ def test_cem_equals_the_upstream_plan_for_the_same_seed(case: dict) -> None:
         where.lower[closing:, GRIPPER] = where.upper[closing:, GRIPPER] = 1.0
     plan = Planner(settings, where).plan(upstream_cost, torch.Generator().manual_seed(case["seed"]))
     expected = torch.tensor(case["actions"])
-    if closing is not None:  # there a mean on its way to 1
+    if closing is not None:  # upstream's value is a mean that is still approaching 1
         expected[closing:, 6] = 1.0
     torch.testing.assert_close(plan.actions, expected, atol=1e-6, rtol=1e-5)
 
@@ -112,7 +112,7 @@ def test_cem_with_jepa_wms_settings_equals_its_plan(case: dict) -> None:
     settings = PlanningConfig(
         planner={"name": "cem", "options": {**none, "try_mean": True}},
         horizon=3,
-        samples=304,  # then their one draw and our three give the same numbers
+        samples=304,  # so that one draw of JEPA-WMs and three draws here give the same numbers
         iterations=15,
         limits=LimitsConfig(xyz=(0.1, 0.1, 0.1), rotation=0.1, gripper=0.75, gripper_mode="free"),
     )
@@ -168,7 +168,7 @@ def test_unbounded_cost_keeps_the_plan_within_the_limits(planner: str) -> None:
 
 
 class FakeClock:
-    """A clock that only a test advances."""
+    """A clock that advances only on request."""
 
     def __init__(self) -> None:
         self.time = 100.0
@@ -223,8 +223,8 @@ def test_icem_reuses_elites() -> None:
     settings = config("icem", iterations=2, samples=40, options={"elites": 10, "kept": 0.3})
     plan = Planner(settings, space(2)).plan(cost, torch.Generator(), start)
     assert torch.equal(shown[0][40:], start.elites[:3])
-    assert torch.equal(shown[1][32:35], plan.iterations[0].elites[:3])  # 40 / 1.25 fresh ones stand before
-    torch.testing.assert_close(shown[1][35], plan.iterations[0].mean)  # the last iteration tries the mean
+    assert torch.equal(shown[1][32:35], plan.iterations[0].elites[:3])  # 40 / 1.25 new samples come first
+    torch.testing.assert_close(shown[1][35], plan.iterations[0].mean)  # the last iteration also evaluates the mean
     assert all(later.lowest <= earlier.lowest for earlier, later in pairwise(plan.iterations))
 
 

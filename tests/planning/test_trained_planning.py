@@ -33,7 +33,7 @@ PRODUCTS = ("mm", "addmm", "bmm", "baddbmm")
 
 
 def trained_model(adapter: AdapterConfig, dtype: torch.dtype = torch.float32) -> WorldModel:
-    """Return a tiny model in which all that is trained was moved."""
+    """Return a tiny model whose trainable weights were changed."""
     model = tiny_model().to(dtype)
     add_adapter(model, adapter, seed=0)
     generator = torch.Generator().manual_seed(2)
@@ -68,7 +68,7 @@ def test_bfloat16_energies_equal_float32_up_to_rounding(adapter: AdapterConfig) 
     model, tried = trained_model(adapter, torch.bfloat16), actions(50, 2)
     precise, base = copy.deepcopy(model).float(), tiny_model().to(torch.bfloat16)
     exact, of_base = cost(precise)(tried), cost(copy.deepcopy(base).float())(tried)
-    rounding = (cost(base)(tried) - of_base).norm() / of_base.norm()  # of a model that was never trained
+    rounding = (cost(base)(tried) - of_base).norm() / of_base.norm()  # of an untrained model
     error = (cost(prepare_for_planning(model, PLAIN))(tried) - exact).norm() / exact.norm()
     assert error < 2 * rounding < 0.01
 

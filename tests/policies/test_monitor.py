@@ -118,7 +118,7 @@ def test_false_alarm_rate_is_at_most_the_requested_rate(count: int, share: float
     drawn = torch.rand(count, generator=torch.Generator().manual_seed(seed))
     threshold = compute_conformal_threshold(drawn, share)
     above = int((drawn > threshold).sum())
-    assert above / (count + 1) <= share < (above + 2) / (count + 1)  # exactly k of n + 1 equally likely places
+    assert above / (count + 1) <= share < (above + 2) / (count + 1)  # exactly k of n + 1 equally likely ranks
 
 
 @pytest.mark.parametrize(("count", "share"), [(18, 0.05), (5, 0.1), (3, 0.0)])
@@ -129,7 +129,11 @@ def test_too_few_episodes_for_a_threshold_raise(count: int, share: float) -> Non
 
 def test_surprise_is_the_mean_excess_over_the_usual_error() -> None:
     errors, usual = torch.zeros(2, 4), torch.tensor([1.0, 0.0, 0.0, 0.0])
-    errors[0, 0], errors[1, 0], errors[1, 3] = 1.0, 3.0, 2.0  # in a patch that is often far off, and in a calm one
+    errors[0, 0], errors[1, 0], errors[1, 3] = (
+        1.0,
+        3.0,
+        2.0,
+    )  # in a patch with usually large errors, and in one with small errors
     assert compute_surprise(errors, usual).tolist() == [0.0, 1.0]
 
 

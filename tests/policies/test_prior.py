@@ -34,7 +34,7 @@ MEAN = (0.03, -0.02, 0.01, 0.0, 0.0, 0.0, 0.3)
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A prior that always says the same, of the tiny model's encoder."""
+    """Return the folder of a prior for the tiny model's encoder that always proposes the same action."""
     model, prior = tiny_model(), ActionPrior(SIZES)
     with torch.no_grad():
         prior.outer.weight.zero_()
@@ -112,7 +112,7 @@ def test_prior_of_another_encoder_or_damaged_file_raises(folder: Path) -> None:
 def test_prior_training_is_deterministic_beats_zero_action_and_uses_the_goal(
     make_config: MakeConfig, tmp_path: Path
 ) -> None:
-    """On episodes whose actions are drawn at random, what leads to a goal is only to be seen in the goal."""
+    """The actions of the episodes are random, so only the goal determines which action leads to it."""
     config, reporter = make_config(), SilentReporter()
     first = train_prior(config, tmp_path / "a", PriorOptions(steps=60, batch_size=8), reporter)
     again = train_prior(config, tmp_path / "b", PriorOptions(steps=60, batch_size=8))

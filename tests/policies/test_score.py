@@ -37,7 +37,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 def policy(dataset: Dataset, name: str, noise: float, chunks: int = 3, steps: int = 4) -> PolicyChunks:
-    """What was done, more or less: targets at control rate."""
+    """Return the demonstrated actions plus noise, as targets at control rate."""
     rng, places, found = np.random.default_rng(1), [], []
     for number in range(EPISODES):
         states = dataset.source.read(number).states
@@ -51,7 +51,7 @@ def policy(dataset: Dataset, name: str, noise: float, chunks: int = 3, steps: in
 
 
 class OracleController(Controller):
-    """Its energy is the distance to the true actions, which are the first of all that it is asked for."""
+    """A controller whose energy is the distance to the true actions, which are the first chunk."""
 
     is_blind = False
 
@@ -91,7 +91,7 @@ def test_model_at_chance_is_blind(dataset: Dataset) -> None:
 
 
 class RecordingController(OracleController):
-    """Notes what it is asked for."""
+    """A controller that records the chunks to score."""
 
     def score(self, frame: np.ndarray, state: np.ndarray, chunks: np.ndarray) -> ChunkScores:
         self.frames, self.chunks = [*getattr(self, "frames", []), frame], [*getattr(self, "chunks", []), chunks]
@@ -163,7 +163,7 @@ def test_run_ranking_error_is_read_from_its_validation(tmp_path: Path, whole_run
     assert read_run_ranking_error(str(tmp_path), "") is None
 
 
-def test_the_command_scores_policies(whole_run: Path, data_folder: Path, tmp_path: Path) -> None:
+def test_score_command_ranks_policies(whole_run: Path, data_folder: Path, tmp_path: Path) -> None:
     dataset = open_dataset(data_folder, frames=4, stride=2, workers=0)
     chunks = dataset.source.read(0).states[1:5][None, None]
     place = {"episodes": np.array([dataset.table.identity(0)]), "frames": np.array([0])}

@@ -24,7 +24,7 @@ def get_replies(messages: list[bytes]) -> list[dict | str]:
     return [unpack(reply) if isinstance(reply, bytes) else reply for reply in replies]
 
 
-def test_recorded_openpi_messages_get_the_same_replies_as_own_messages() -> None:
+def test_recorded_openpi_messages_get_the_same_replies_as_messages_of_our_client() -> None:
     assert [path.stem for path in FRAMES] == list(MADE["DIALOGUE"])
     openpi_replies = get_replies([path.read_bytes() for path in FRAMES])
     own_replies = get_replies([pack(message) for message in MADE["DIALOGUE"].values()])

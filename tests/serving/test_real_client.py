@@ -20,11 +20,11 @@ CUP = {"cup": (SubGoal(image(50), "cup"),)}
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the Python of an environment with the client and what it asks for, which is not ours."""
+    """Return the Python of a separate environment with the client and its dependencies."""
     here = tmp_path_factory.mktemp("robot")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", here], check=True, capture_output=True)
     python = here / "bin/python"
-    install(python, CLIENT, "typing_extensions")  # which the client imports and does not ask for
+    install(python, CLIENT, "typing_extensions")  # which the client imports without declaring it as a dependency
     return python
 
 

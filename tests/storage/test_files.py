@@ -106,7 +106,7 @@ def test_new_folder_appears_complete_or_not_at_all(tmp_path: Path) -> None:
     assert names(tmp_path / "deep" / "new") == ["a", "inner", "manifest"]
 
 
-def test_existing_folder_is_kept_with_its_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_existing_folder_keeps_its_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine").write_text("precious")
     (tmp_path / "manifest").write_text("old")
     before = tmp_path.stat().st_ino
@@ -119,7 +119,7 @@ def test_existing_folder_is_kept_with_its_other_files(tmp_path: Path, monkeypatc
 
 def test_failed_move_leaves_no_manifest(tmp_path: Path) -> None:
     (tmp_path / "manifest").write_text("old")
-    (tmp_path / "a").mkdir()  # where a file is to go
+    (tmp_path / "a").mkdir()  # target of a write
     (tmp_path / "a" / "mine").write_text("precious")
     with pytest.raises(InputError, match=r"cannot be written: .*directory"):
         fill(tmp_path, "a", "manifest")
@@ -134,7 +134,7 @@ def test_path_that_cannot_be_a_folder_raises(tmp_path: Path, place: str) -> None
     assert caught.value.where == str(tmp_path / place)
 
 
-# ---- writers that end early ----
+# ---- interrupted writers ----
 
 
 @pytest.mark.usefixtures("default_signals")

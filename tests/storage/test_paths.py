@@ -65,7 +65,7 @@ def test_url_for_a_local_path_key_raises(key: str, url: str) -> None:
 
 
 @pytest.mark.parametrize("key", ANYWHERE)
-def test_url_is_kept_for_other_path_keys(key: str) -> None:
+def test_url_is_unchanged_for_other_path_keys(key: str) -> None:
     assert read(key, "gs://bucket/~x/") == "gs://bucket/~x"
 
 

@@ -51,7 +51,7 @@ def test_all_reads_survive_temporary_failures(
 
 
 def test_unresponsive_server_is_retried(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    # A busy machine is slow as well: it has further attempts.
+    # Further attempts, because a busy machine may exceed the time-out.
     monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=100, first_wait_s=0.0, timeout_s=0.3))
     gcs.fail_next("hang", match="/download/")
     assert storage.read_range(file, 0, 5) == DATA[:5]
@@ -68,7 +68,7 @@ def test_failed_retries_raise_with_attempts_url_and_reason(gcs: Gcs, file: str, 
     gcs.fail_next(failure, times=100, match="/download/")
     with pytest.raises(UnreachableError, match=rf"^{file}: 5 attempts in .* failed.*{message}.*Check the net"):
         storage.read_range(file, 0, 5)
-    attempts = 5 if failure != "reset" else 10  # aiohttp asks again at once where a connection in use before was cut
+    attempts = 5 if failure != "reset" else 10  # aiohttp retries at once if a reused connection was closed
     assert len(gcs.reads()) <= attempts, "gcsfs would make six of each"
 
 
@@ -96,7 +96,7 @@ def test_read_past_the_end_returns_the_rest(gcs: Gcs, file: str) -> None:
     size = len(DATA)
     assert storage.read_range(file, size - 3, 10) == DATA[-3:]
     assert storage.read_range(file, size + 3, 10) == b""
-    gcs.fail_next(416, match="/download/")  # what Google says there
+    gcs.fail_next(416, match="/download/")  # as Google Cloud Storage responds
     assert storage.read_range(file, size, 10) == b""
     assert storage.read_range(file, 0, 0) == b""
     with pytest.raises(remote.ShortReadError, match=f"3 of 10 bytes at {size - 3}"):
@@ -160,7 +160,7 @@ def test_missing_protocol_library_raises_with_the_extra(url: str, extra: str, mo
         storage.exists(url)
 
 
-# ---- who logs in ----
+# ---- logins ----
 
 
 @pytest.fixture
@@ -266,8 +266,8 @@ def test_lasting_network_failure_logs_one_warning(
         return sum(record.levelname == "WARNING" for record in caplog.records)
 
     monkeypatch.setattr(retries, "_last_warning_s", [float("-inf")])
-    assert spoken(attempts=3) == 0  # two failures are nothing
+    assert spoken(attempts=3) == 0  # two failures cause no warning
     with retries.suppress_retry_warnings():
-        assert spoken(attempts=6) == 0  # by whoever can do without
+        assert spoken(attempts=6) == 0  # within `suppress_retry_warnings`
     assert spoken(attempts=6) == 1
-    assert spoken(attempts=6) == 0  # said already
+    assert spoken(attempts=6) == 0  # the warning was logged less than 30 s ago

@@ -1,4 +1,4 @@
-"""Uploads: complete despite temporary failures; permanent ones are reported in time."""
+"""Uploads: complete despite temporary failures; permanent failures are reported in time."""
 
 import os
 from pathlib import Path
@@ -25,7 +25,7 @@ def bucket(gcs: Gcs) -> Gcs:
 
 def source_of(folder: Path, size: int) -> Path:
     path = folder / "source"
-    # gcsfs ends its parts with a bare "\n": the emulator takes a "\r" that the data end with for a part of it
+    # gcsfs ends its parts with "\n", and the emulator removes a "\r" at the end of the data
     path.write_bytes(os.urandom(max(size - 1, 0)) + b"\0" * (size > 0))
     return path
 
@@ -74,7 +74,7 @@ def test_failure_between_pieces_leaves_nothing_and_restarts_the_upload(
 
 
 def test_stalled_upload_times_out_and_is_retried(bucket: Gcs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # A busy machine is slow as well: it has further attempts.
+    # Further attempts, because a busy machine may exceed the time-out.
     monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=100, first_wait_s=0.0, timeout_s=0.3))
     source = source_of(tmp_path, SMALL)
     bucket.fail_next("hang", match="POST /upload/")

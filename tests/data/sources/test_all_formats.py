@@ -146,7 +146,7 @@ def without_permission(folder: Path) -> Iterator[None]:
 @pytest.mark.parametrize("form", FORMATS)
 def test_file_without_permission_raises_unreachable_error(forms: Path, form: str, tmp_path: Path) -> None:
     shutil.copytree(forms / form, tmp_path / form)
-    for folder in (tmp_path, *tmp_path.parents):  # under root the test runs as the user `nobody`
+    for folder in (tmp_path, *tmp_path.parents):  # a test that is run by root switches to an unprivileged user
         if folder.owner() == forms.owner() and folder.is_relative_to(tempfile.gettempdir()):
             folder.chmod(0o755)
     (tmp_path / "new").mkdir()

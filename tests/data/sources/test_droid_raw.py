@@ -210,12 +210,12 @@ def test_remote_tree_equals_local_tree(tree: Path, gcs: Gcs, tmp_path: Path) -> 
     gcs.forget()
     infos = pickle.loads(pickle.dumps(raw))  # noqa: S301 - our own
     np.testing.assert_array_equal(infos.read(1).read_frames([7]), same.read_frames([7]))
-    assert gcs.requests == []  # all of it is kept, and how long it is
+    assert gcs.requests == []  # the content and the length of the video are cached
 
 
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An episode whose video is megabytes: noise does not compress."""
+    """Return an episode whose video has megabytes, because noise does not compress."""
     chance = np.random.default_rng(0)
     noise = [chance.integers(0, 256, (144, 256, 3), np.uint8) for _ in range(3)]
     root = tmp_path_factory.mktemp("noisy")

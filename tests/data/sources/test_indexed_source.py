@@ -1,4 +1,4 @@
-"""What all sources have in common: they are opened once, may contain one another, and refuse unusable identities."""
+"""All sources: a source is opened once, may read from another source, and refuses unusable identities."""
 
 import pickle
 import re
@@ -48,7 +48,7 @@ class EveryOther(IndexedSource[DataConfig, NpzSource]):
 
 
 def run_together(*tasks: Callable[[], T]) -> list[T]:
-    """Return the results of tasks, each run by a thread of its own; fail where one is missing after 20 s."""
+    """Return the results of tasks that run in separate threads; fail if a result is missing after 20 s."""
     results: list[T] = []
     threads = [threading.Thread(target=lambda one=task: results.append(one()), daemon=True) for task in tasks]
     for thread in threads:

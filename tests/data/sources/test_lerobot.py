@@ -1,4 +1,4 @@
-"""LeRobot data sets: the same states and the right frames from v3.0 and v2.1, conventions, and what can be wrong."""
+"""LeRobot data sets v3.0 and v2.1: equal states and the right frames; conventions; errors of settings and files."""
 
 import json
 import pickle
@@ -75,7 +75,7 @@ def either(request: pytest.FixtureRequest) -> Path:
 
 @pytest.fixture
 def copy(either: Path, tmp_path: Path) -> Path:
-    """A data set of either version to spoil."""
+    """Return a copy of a data set of either version, which a test may change."""
     return Path(shutil.copytree(either, tmp_path / "set"))
 
 
@@ -87,7 +87,7 @@ def first_video(root: Path) -> Path:
     return next(path for path in sorted(root.glob("videos/**/*.mp4")) if KEY in str(path))
 
 
-# --- what is read ------------------------------------------------------------------------------------------------
+# --- reading -----------------------------------------------------------------------------------------------------
 
 
 def test_states_equal_the_written_states_in_every_version(either: Path, episodes: list[Recorded]) -> None:
@@ -194,7 +194,7 @@ def test_all_rotation_formats_give_the_same_pose(convention: str, tmp_path: Path
     states = synthetic_states(20, seed=3)
     matrices = matrices_from_euler(states[:, 3:6])
     quaternions = Rotation.from_matrix(matrices).as_quat(scalar_first=convention == "quaternion_wxyz")
-    quaternions[::2] *= -1  # q and -q are one rotation
+    quaternions[::2] *= -1  # q and -q are the same rotation
     own = np.concatenate([states[:, :3], quaternions, states[:, 6:]], axis=1)
     source = source_of(write_data_set(tmp_path / "set", own), lerobot=OWN | {"rotation": convention})
     read = source.read(0).states
@@ -218,7 +218,7 @@ def test_gripper_is_converted_to_closedness(opened: float, closed: float, tmp_pa
             source_of(root, lerobot=OWN).infos()
 
 
-# --- settings at fault -------------------------------------------------------------------------------------------
+# --- invalid settings --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -311,11 +311,11 @@ def test_missing_data_set_raises_with_expected_layout(tmp_path: Path) -> None:
         source_of(tmp_path).infos()
 
 
-# --- episodes that cannot be used --------------------------------------------------------------------------------
+# --- unusable episodes ------------------------------------------------------------------------------------------
 
 
 def spoiled(make: Callable[[list[list[float]]], Any]) -> Callable[[Path], None]:
-    """Return what replaces the positions of a set's first file by what is made of them."""
+    """Return a function that replaces the states in the first file of a data set by `make(states)`."""
 
     def spoil(root: Path) -> None:
         rows = pq.read_table(first_rows(root)).column(STATE[0]).to_pylist()

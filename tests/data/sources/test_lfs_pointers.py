@@ -1,4 +1,4 @@
-"""A git-lfs pointer in place of a file is named as such, in every format, on this machine and behind a URL."""
+"""A git-lfs pointer in place of a file raises an error that names it, in every format, locally and behind a URL."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ FORMS = WRITERS | {
 
 
 def replaced_by_pointers(folder: Path, pattern: str) -> Path:
-    """Write pointers in place of the files that fit a pattern."""
+    """Replace the files that match a pattern with git-lfs pointers."""
     files = [*folder.rglob(pattern)]
     assert files
     for file in files:

@@ -35,7 +35,7 @@ def test_missing_reader_library_does_not_mark_episodes_as_broken(
 
 
 def test_missing_video_decoder_prevents_indexing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Or the states of a hundred thousand episodes would be read before the first frame is missed."""
+    """Otherwise the states of 100,000 episodes would be read before the first frame fails."""
     folder, told = write_v21(tmp_path / "set", [recorded(0, 20)]), []
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(UnreachableError, match=r"PyAV, which decodes and writes video, is not installed.*pip install"):

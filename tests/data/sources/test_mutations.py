@@ -1,4 +1,4 @@
-"""Damaged files of every format: the damage is named, or has no effect."""
+"""Damaged files of every format: the damage raises an error, or has no effect."""
 
 import json
 import os
@@ -46,7 +46,7 @@ def write(form: str, root: Path) -> DataConfig:
 
 
 def everything(config: DataConfig) -> dict[str, Any]:
-    """Return the numbers and frames of each episode, or what is said of it; only InputError may be raised."""
+    """Return the numbers and frames of each episode, or its error; only InputError may be raised."""
     source = open_source(config)
     try:
         infos = source.infos()
@@ -96,7 +96,7 @@ def test_random_damage_is_detected_or_harmless(form: str, pattern: str, equal: i
         path.write_bytes(mutated(data, generator))
         after = everything(config)
         case = f"mutation {number}: {path.name}"
-        extra = len(after) - len(before)  # of RLDS, bytes after the last record are a problem of their own
+        extra = len(after) - len(before)  # bytes after the last record of an RLDS file are an additional problem
         assert "the set" in after or 0 <= extra <= (form == "droid"), f"{case}: an episode was lost, or counted twice"
         for name, content in after.items():
             if isinstance(content, str):

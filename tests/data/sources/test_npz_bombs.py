@@ -1,4 +1,4 @@
-""".npz bombs: a short file that claims to be long is named, without decompressing it."""
+""".npz bombs: a small file with a huge stated size raises an error without being decompressed."""
 
 import struct
 import tracemalloc
@@ -25,7 +25,7 @@ _MB = 1 << 20
 
 
 def described(shape: tuple[int, ...], kind: str, *, claimed: int | None = None) -> bytes:
-    """Return the head of an array, as numpy writes it; it may claim to be longer than it is."""
+    """Return the header of an array, as NumPy writes it; the stated shape may exceed the data."""
     text = str({"descr": kind, "fortran_order": False, "shape": shape}).encode().ljust(117) + b"\n"
     if claimed is None:
         return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text

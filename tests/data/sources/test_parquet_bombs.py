@@ -1,4 +1,4 @@
-"""Parquet bombs: a short file that claims to be long is named, and not decompressed beyond the limits."""
+"""Parquet bombs: a small file with a huge content raises an error and is not decompressed beyond the limits."""
 
 import tracemalloc
 from pathlib import Path
@@ -20,7 +20,7 @@ STATE = "observation.state"
 
 
 def repeated(value: str | bytes, rows: int) -> pa.Array:
-    """Return a column that holds one value once, and says how often it stands there."""
+    """Return a dictionary-encoded column of `rows` equal values, which stores the value once."""
     return pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array([value]))
 
 
@@ -47,7 +47,7 @@ def test_repeated_texts_are_rejected_before_conversion_to_python(
     [("contradicting_footer", "Definition level histogram"), ("mistyped_footer", "ColumnMetaData type does not match")],
 )
 def test_inconsistent_footer_raises_without_aborting_the_process(name: str, message: str, tmp_path: Path) -> None:
-    """Asked for this column's account in the footer, pyarrow 26 would abort this very process."""
+    """Without the check, pyarrow 26 aborts the process if it reads this column's entry of the footer."""
     columns = ("frame_index", "timestamp", "observation.state.cartesian_position", "action.joint_velocity")
     with pytest.raises(InputError, match=rf"{name}\.parquet: the file is damaged: {message}"):
         rows_of(tmp_path, *columns).read_rows(str(GOLDEN / f"{name}.parquet"), 0)

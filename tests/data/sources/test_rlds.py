@@ -1,4 +1,4 @@
-"""RLDS episodes: read exactly, and every error is named."""
+"""RLDS episodes are read exactly, and errors name the record."""
 
 import dataclasses
 import json
@@ -108,7 +108,7 @@ def test_real_robot_episodes_with_mapped_feature_names(shared: Path) -> None:
     for number, info in enumerate(infos):
         episode = source.read(number)
         assert info.success is None
-        assert episode.read_frames([0, info.num_steps - 1]).std() > 20  # pictures of something
+        assert episode.read_frames([0, info.num_steps - 1]).std() > 20  # images of arbitrary content
         assert abs(np.diff(episode.states[:, :3], axis=0)).max() < 0.1  # metres in a fifth of a second
         assert episode.states[:, 6].min() > -0.05
         assert episode.states[0, 6] < 0.1  # the gripper starts open
@@ -168,13 +168,13 @@ def test_first_read_on_a_machine_detects_damage(droid: Path, tmp_path: Path) -> 
     shard = sorted(folder.glob("*.tfrecord-*"))[0]
     open_droid(folder).read(0)
     change_silently(shard, index_records(shard)[0].end - 10, shard.stat())
-    open_droid(folder).read(0)  # as another process would
+    open_droid(folder).read(0)  # as another process would do
     with pytest.raises(InputError, match="record 0 at byte 0: the CRC of the data does not match"):
         open_droid(folder, disk_cache={"dir": str(tmp_path / "other")}).read(0)
 
 
 def change_silently(file: Path, place: int, status: os.stat_result) -> None:
-    """Flip a bit as a dying disk does: neither size nor time tell."""
+    """Flip a bit without changing size and modification time, as a failing disk does."""
     whole = bytearray(file.read_bytes())
     whole[place] ^= 1
     file.write_bytes(whole)

@@ -1,4 +1,4 @@
-"""RLDS on Google Cloud Storage: read like local RLDS, with few bytes, over networks that fail."""
+"""RLDS on Google Cloud Storage equals local RLDS, fetches few bytes, and survives network failures."""
 
 import sys
 from collections.abc import Callable
@@ -65,7 +65,7 @@ def test_remote_reads_equal_local_reads(
     assert not remote.infos().problems
     for number in range(6):
         for camera in RldsFields().cameras:
-            for _ in range(2):  # fetched, and kept
+            for _ in range(2):  # first fetched, then read from the cache
                 assert same(remote.read(number, camera), local.read(number, camera), [11, 0, 3])
 
 
@@ -134,7 +134,7 @@ def test_intermittent_network_errors_do_not_change_results(
 
     assert failing(lambda: list(open_remote(droid).infos())) == list(local.infos())
     source = open_remote(droid, limit_gb=0.0)
-    for _ in range(2):  # frames of the whole camera; then, their places known, each by itself
+    for _ in range(2):  # first all images of the camera; then, with known positions, single images
         episode = failing(lambda: source.read(2))
         assert failing(lambda episode=episode: same(episode, local.read(2), [0, 5]))
 

@@ -1,4 +1,4 @@
-"""TFRecords: read back as written, and every damage is found and named."""
+"""TFRecords are read back as written, and every damage is detected and described."""
 
 from collections.abc import Callable
 from pathlib import Path
