@@ -13,8 +13,8 @@ State (7 numbers, a pose): x, y, z in metres; roll, pitch, yaw in radians, as ex
     is the flange, not the finger tip. States are *measured*. With `data.states: vector` a state is a
     vector of state_dim numbers from the source.
 
-Action (7 numbers, of poses): the change from a state to the state of the next *model* step: metres, extrinsic xyz Euler
-    angles of R[t+1] @ R[t].T, and the change of closedness. See `spaces.actions_from_states`. Of vectors:
+Action (7 numbers, of a pose): the change from a state to the state of the next *model* step: metres, extrinsic xyz
+    Euler angles of R[t+1] @ R[t].T, and the change of closedness. See `spaces.actions_from_states`. For vectors see
     `data.actions`.
 
 Extrinsics (6 numbers): the camera in the robot base frame: x, y, z, roll, pitch, yaw.
@@ -39,7 +39,7 @@ Progress = Callable[[int, int], None]  # done, total
 
 
 def no_progress(done: int, total: int) -> None:
-    """Show nothing."""
+    """Ignore the progress."""
 
 
 def shorten_names(names: Sequence[str]) -> dict[str, str]:
@@ -80,7 +80,7 @@ class StoredLatents:
     """Latents of frames as a cache stores them; `latent_files.unpack_latents` makes them float32 on the device."""
 
     values: Num[Tensor, "*batch time tokens dim"]  # bfloat16, float32 or int8
-    scales: Float32[Tensor, "*batch time tokens"] | None = None  # of int8: the value of 1, for each token
+    scales: Float32[Tensor, "*batch time tokens"] | None = None  # for int8: the scale of each token
 
     def map_tensors(self, change: Callable[[Tensor], Tensor]) -> StoredLatents:
         """Return the latents with each tensor replaced."""
@@ -93,7 +93,7 @@ LatentReader = Callable[[Sequence[int]], StoredLatents]
 
 @dataclass(frozen=True, slots=True)
 class EpisodeInfo:
-    """Facts about an episode that are known without its frames: enough to choose clips from it."""
+    """Facts about an episode that are known without its frames: enough to select clips from it."""
 
     id: str  # independent of the order of episodes and the number of shards
     num_steps: int
@@ -112,7 +112,7 @@ class Episode:
     joint_velocities: Float[np.ndarray, "steps joints"] | None = None  # *commanded*, radians per second
     metadata: Mapping[str, str] = field(default_factory=dict)  # language instruction and the like; never interpreted
     commands: Float[np.ndarray, "steps action_dim"] | None = None  # recorded actions, if `data.actions` requests them
-    read_latents: LatentReader | None = None  # of a cache; its `read_frames` gives small frames for people to look at
+    read_latents: LatentReader | None = None  # of a cache; its `read_frames` returns small frames for display
     frame_steps: Int[np.ndarray, " frames"] | None = None  # control steps that have a frame, ascending; None: all
 
 
@@ -204,7 +204,7 @@ class LatentBatch:
         return LatentBatch(*tensors, self.episode_ids[rows], self.starts[rows])
 
 
-StepRanges = Sequence[tuple[int, int]]  # [start, end) of control steps, ascending and apart
+StepRanges = Sequence[tuple[int, int]]  # [start, end) of control steps, ascending and disjoint
 
 
 @runtime_checkable
@@ -217,7 +217,7 @@ class EpisodeSource(Protocol):
     def infos(self, progress: Progress | None = None) -> Sequence[EpisodeInfo]:
         """Return the facts about every usable episode, in the order of `read`.
 
-        Slow the first time (`progress` is called), fast afterwards: the result is cached on disk.
+        The first call may be slow, and calls `progress`. Later calls are fast, because the result is cached on disk.
 
         Raises:
             InputError: There is no such data set, or it is damaged beyond what `data.broken_episodes` allows.
@@ -230,7 +230,7 @@ class EpisodeSource(Protocol):
         Args:
             index: Index in `infos`.
             camera: Name of the camera; None: the first camera of the config.
-            needed: Steps that clips may come from, None: all. A remote source caches no others.
+            needed: Steps that clips may come from; None: all. A remote source caches only these steps.
 
         Raises:
             InputError: The episode cannot be read, or does not match the data set's description.

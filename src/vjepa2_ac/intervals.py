@@ -21,13 +21,13 @@ import numpy as np
 from jaxtyping import Float
 
 RESAMPLES = 2000
-MIN_EPISODES = 5  # with fewer, an interval over episodes means little
+MIN_EPISODES = 5  # with fewer episodes an interval is unreliable
 _CONFIDENCE = 0.95  # probability that an interval covers the true value
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with a 95 % bootstrap interval over episodes; NaN where there is one episode only."""
+    """A number with a 95 % bootstrap interval over episodes; the bounds are NaN for a single episode."""
 
     value: float
     low: float
@@ -61,43 +61,43 @@ class Estimate:
 
 
 def bootstrap(
-    of_sums: Callable[[np.ndarray], np.ndarray],
+    compute_metrics: Callable[[np.ndarray], np.ndarray],
     columns: Float[np.ndarray, "columns clips metrics"],
     episode_ids: Sequence[str],
 ) -> tuple[Estimate, ...]:
     """Return an estimate of each metric, which is a function of sums over clips.
 
     Args:
-        of_sums: Turns sums [columns, ..., metrics] into values [..., metrics].
-        columns: The summands. All columns are resampled together, so a comparison of two on the same clips is paired.
-        episode_ids: Of each clip.
+        compute_metrics: Computes the metrics [..., metrics] from sums [columns, ..., metrics].
+        columns: The summands. All columns are resampled together, so that comparisons on the same clips are paired.
+        episode_ids: Episode of each clip.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = of_sums(columns.sum(axis=1))
+        values = compute_metrics(columns.sum(axis=1))
         names, episode_of = np.unique(np.array(episode_ids), return_inverse=True)
         count = len(names)
         if count < 2:
             return tuple(Estimate(float(value), math.nan, math.nan) for value in values)
         sums = np.einsum("cnf,ne->cef", columns, np.eye(count)[episode_of], optimize=True)
-        drawn = of_sums(np.einsum("re,cef->crf", _draw_episode_counts(count), sums, optimize=True))
+        drawn = compute_metrics(np.einsum("re,cef->crf", _draw_episode_counts(count), sums, optimize=True))
     return _make_estimates(values, drawn, count)
 
 
 def bootstrap_by_weights(
-    of_weights: Callable[[Float[np.ndarray, "draws episodes"]], Float[np.ndarray, "draws metrics"]],
+    compute_metrics: Callable[[Float[np.ndarray, "draws episodes"]], Float[np.ndarray, "draws metrics"]],
     episodes: int,
 ) -> tuple[Estimate, ...]:
-    """Return an estimate of each metric that is a function of how often each episode counts, as sums over pairs are.
+    """Return an estimate of each metric that is a function of the weights of the episodes, such as sums over pairs.
 
     Args:
-        of_weights: Turns weights of the episodes into values; all weights 1 give the estimate itself.
-        episodes: Their number; an interval needs two. The samples are those of `bootstrap`.
+        compute_metrics: Computes the metrics from weights; the weights of the estimate itself are all 1.
+        episodes: Number of episodes; an interval needs two. The samples are those of `bootstrap`.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = of_weights(np.ones((1, episodes)))[0]
+        values = compute_metrics(np.ones((1, episodes)))[0]
         if episodes < 2:
             return tuple(Estimate(float(value), math.nan, math.nan) for value in values)
-        return _make_estimates(values, of_weights(_draw_episode_counts(episodes)), episodes)
+        return _make_estimates(values, compute_metrics(_draw_episode_counts(episodes)), episodes)
 
 
 def estimate_mean(values: Float[np.ndarray, " clips"], episode_ids: Sequence[str]) -> Estimate:
@@ -131,7 +131,7 @@ def estimate_ratio_difference(
 ) -> Estimate:
     """Return the ratio of the first pair (errors, persistence) minus that of the second, on the same clips.
 
-    Both are resampled together, so what makes an episode hard for both does not widen the interval.
+    Both are resampled together, so that an episode's difficulty for both does not widen the interval.
     """
     columns = np.stack([*first, *second])[:, :, None]
     return bootstrap(lambda sums: sums[0] / sums[1] - sums[2] / sums[3], columns, episode_ids)[0]

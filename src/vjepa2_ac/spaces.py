@@ -1,7 +1,7 @@
 """State and action spaces: the meaning of the numbers of a robot, their plausible ranges, and how states change.
 
-A pose has a position, a rotation and a gripper (conventions: `vjepa2_ac.episode`). Of a vector only the width is known:
-a robot's joints, two arms, a mobile base. `space.position` is None for a space without a position.
+A pose has a position, a rotation and a gripper (conventions: `vjepa2_ac.episode`). For a vector, such as
+the joints of a robot, two arms or a mobile base, only the width is known. `space.position` is None for a space without a position.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MAX_POSITION_M = 5.0  # larger positions are not in metres
 MAX_ANGLE_RAD = 2 * math.pi + 0.1  # larger angles are not in radians
 _LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw is determined
 GRIPPER_SLACK = 0.1  # a measured closedness may exceed 0 .. 1 by this
-CONVERSIONS = {  # how to bring numbers in other units to metres and radians
+CONVERSIONS = {  # conversions from other units to metres and radians
     "millimetres": "divide them by 1000",
     "centimetres": "divide them by 100",
     "degrees": "multiply them by pi / 180",
@@ -122,7 +122,7 @@ def apply_action(state: Any, action: Any) -> Any:
 def states_in_camera_frame(
     states: Float[np.ndarray, "time 7"], extrinsics: Float[np.ndarray, "time 6"]
 ) -> Float[np.ndarray, "time 7"]:
-    """Return states whose pose is given in the camera's frame: inverse(camera pose) @ pose. The gripper stays.
+    """Return states whose pose is given in the camera's frame: inverse(camera pose) @ pose. The gripper is unchanged.
 
     Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/droid.py, transform_frame.
     """
@@ -228,18 +228,18 @@ class StateSpace(Space):
         """
         if len(states) == 0:
             raise no_steps_error(where)
-        for is_wrong, needed in self._checks(states):
+        for is_wrong, needed in self._check_rules(states):
             if is_wrong.any():
                 step = int(is_wrong.argmax())
                 position = f"{where}: step {step}" if len(states) > 1 else where
                 problem = f"the numbers {np.array2string(states[step], precision=4, max_line_width=200)}"
-                looks = [
+                guesses = [
                     f"The {part} look like {unit}: {conversions[unit]}"
-                    for part, unit in self._likely_units(states)
+                    for part, unit in self._guess_units(states)
                     if unit in conversions
                 ]
                 raise InputError(
-                    where=position, found=problem, needed=needed, fix=". ".join(filter(None, [*looks, fix]))
+                    where=position, found=problem, needed=needed, fix=". ".join(filter(None, [*guesses, fix]))
                 )
 
     def require_state(self, numbers: np.ndarray, where: str) -> None:
@@ -254,21 +254,21 @@ class StateSpace(Space):
             raise InputError(where=where, found=problem, needed=f"{len(self)}: {', '.join(names)}")
         self.require_plausible(numbers[None], where)
 
-    def _checks(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[np.ndarray, str]]:
-        """Return, for each rule, a mask of the steps that break it, and what is needed."""
+    def _check_rules(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[np.ndarray, str]]:
+        """Return, for each rule, a mask of the steps that violate the rule, and the expected values."""
         checks = [(~np.isfinite(states).all(axis=1), "finite numbers")]
         if self.position is not None:
-            far = abs(states[:, self.position]).max(axis=1) > MAX_POSITION_M
-            checks.append((far, f"a position within {MAX_POSITION_M:g} m of the base, in metres"))
+            is_far = abs(states[:, self.position]).max(axis=1) > MAX_POSITION_M
+            checks.append((is_far, f"a position within {MAX_POSITION_M:g} m of the base, in metres"))
         if self.rotation is not None:
             checks.append((abs(states[:, self.rotation]).max(axis=1) > MAX_ANGLE_RAD, "angles in radians"))
         if self.gripper is not None:
-            closed = states[:, self.gripper]
-            beyond = (closed < -GRIPPER_SLACK) | (closed > 1 + GRIPPER_SLACK)
-            checks.append((beyond, "a gripper between 0 and 1: 0 for open, 1 for closed"))
+            closedness = states[:, self.gripper]
+            is_beyond = (closedness < -GRIPPER_SLACK) | (closedness > 1 + GRIPPER_SLACK)
+            checks.append((is_beyond, "a gripper between 0 and 1: 0 for open, 1 for closed"))
         return checks
 
-    def _likely_units(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[str, str]]:
+    def _guess_units(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[str, str]]:
         """Return the parts of a pose that look like another unit than metres and radians, each with that unit.
 
         Most steps must be too large, because a few wrong steps are outliers that do not show the unit.
@@ -289,7 +289,9 @@ class StateSpace(Space):
 class ActionSpace(Space):
     """The numbers of an action, and how the next state follows from it."""
 
-    follows: Follows = "change"  # change: added to the state. target: becomes the state. unknown: neither is known
+    follows: Follows = (
+        "change"  # change: added to the state. target: becomes the state. unknown: the effect on the state is unknown
+    )
 
 
 def no_steps_error(where: str) -> InputError:
@@ -371,8 +373,8 @@ def apply_actions(
         after = states + actions if space.rotation is None else apply_action(states, actions)
     if space.gripper is None:
         return after
-    closed = after[..., space.gripper :].clamp(0.0, 1.0)  # the last number
-    return torch.cat([after[..., : space.gripper], closed], dim=-1)  # type: ignore[no-any-return]  # untyped
+    closedness = after[..., space.gripper :].clamp(0.0, 1.0)  # the last number
+    return torch.cat([after[..., : space.gripper], closedness], dim=-1)  # type: ignore[no-any-return]  # untyped
 
 
 def integrate_changes(

@@ -71,7 +71,7 @@ def test_unencoded_episode_is_skipped_and_damaged_file_raises(
     gone, damaged = (Path(pairs.files.path(one.episode, one.camera)) for one in pairs.frames[:2])
     gone.unlink()
     dataset = open_dataset(make_config().data)
-    rest = FramePairs.of(dataset, pairs.frames, pairs.files)
+    rest = FramePairs.from_files(dataset, pairs.frames, pairs.files)
     assert rest.episode_ids == pairs.episode_ids[1:]
     assert len(rest) == len(pairs) - len(pairs.frames[0].steps)
     damaged.write_bytes(damaged.read_bytes()[:-100])

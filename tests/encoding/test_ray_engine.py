@@ -28,7 +28,7 @@ needs_ray = pytest.mark.skipif(
     find_spec("ray") is None, reason='Ray is not tested: pip install -c constraints.txt -e ".[cluster]"'
 )
 
-# A plug-in of the config, which actors import, too: from the third file on the encoder waits for the file `go`, or fails.
+# A plug-in of the config, which actors import, too: after two files the encoder waits for the file `go`, or fails.
 ACCIDENT = """
 import time
 from pathlib import Path

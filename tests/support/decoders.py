@@ -50,6 +50,6 @@ def encode_split(tmp_path: Path) -> EncodeSplit:
         wanted = select_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
         files = LatentFiles(tmp_path / folder, "key")
         encode_files(dataset, wanted, encoder, files, lossless_images=True)
-        return FramePairs.of(dataset, wanted, files)
+        return FramePairs.from_files(dataset, wanted, files)
 
     return encode

@@ -32,7 +32,7 @@ def views_of(subject: Path, decoder: Path, data: Path, folder: Path, base: Path)
     """Return the views of a run on data, with a small search."""
     config = tiny_config(folder / "none", data, base, data__test_share=0.5, data__stride=2)
     explorer, config = explorer_of(subject, decoder, EvaluationOptions(data=config, out=folder))
-    return Views.of("the run", explorer, config.model_copy(update={"planning": QUICK}))
+    return Views.create("the run", explorer, config.model_copy(update={"planning": QUICK}))
 
 
 @pytest.fixture(scope="session")

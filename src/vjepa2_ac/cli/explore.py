@@ -126,4 +126,4 @@ def _views(
 
     load = partial(load_models, subject, config, request)
     explorer = open_explorer(config, decoder, options.split, load, SimulatedFutures.of, reporter)
-    return Views.of(subject, explorer, config)
+    return Views.create(subject, explorer, config)

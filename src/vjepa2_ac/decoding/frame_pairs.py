@@ -46,7 +46,7 @@ class FramePairs:
     episode_ids: tuple[str, ...]  # episode of each file
 
     @classmethod
-    def of(cls, dataset: Dataset, selected: Sequence[FramesToEncode], files: LatentFiles) -> FramePairs:
+    def from_files(cls, dataset: Dataset, selected: Sequence[FramesToEncode], files: LatentFiles) -> FramePairs:
         """Return the selected frames that could be encoded."""
         encoded = tuple(frames for frames in selected if files.has_file(frames.episode, frames.camera))
         return cls(files, encoded, tuple(dataset.table.identity(frames.episode) for frames in encoded))
@@ -98,7 +98,7 @@ def select_frames(dataset: Dataset, split: Split, *, frames: int) -> list[Frames
 
 
 _FRAMES = 4_000  # largest number of frames for the linear fit; enough for a matrix of 1,408 x 768 numbers
-_FRAMES_OF_MEAN = 1_000
+_MEAN_IMAGE_FRAMES = 1_000
 _FIT_BATCH_SIZE, _MEASURE_BATCH_SIZE = 64, 32
 _RIDGE = 1e-4  # ridge, relative to the mean second moment of the latents' components
 
@@ -142,7 +142,7 @@ def fit_linear(pairs: FramePairs, shape: DecoderShape, device: torch.device, pro
 @torch.no_grad()
 def compute_mean_image(pairs: FramePairs) -> Float[Tensor, "3 size size"]:
     """Return the mean of some images, spread over the pairs: the output of a decoder that ignores its input."""
-    indices = spread_indices(len(pairs), _FRAMES_OF_MEAN)
+    indices = spread_indices(len(pairs), _MEAN_IMAGE_FRAMES)
     total = sum(to_images(batch.images).sum(dim=0) for batch in _read_parts(pairs, indices, _MEASURE_BATCH_SIZE))
     return torch.as_tensor(total / len(indices))
 

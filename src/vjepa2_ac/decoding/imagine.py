@@ -61,7 +61,7 @@ class Start:
     extrinsics: Float[Tensor, " 6"] | None = None
 
     @classmethod
-    def of(cls, batch: LatentBatch, space: StateSpace) -> Start:
+    def from_batch(cls, batch: LatentBatch, space: StateSpace) -> Start:
         """Return the start of the first clip of a batch."""
         extrinsics = None if batch.extrinsics is None else batch.extrinsics[0, 0]
         return cls(batch.latents[0, 0], batch.states[0, 0].double().cpu().numpy(), space, extrinsics)
@@ -201,7 +201,7 @@ def _describe_action(action: Float[np.ndarray, " action_dim"]) -> str:
 
 
 def _shorten_name(name: str) -> str:
-    """Return the end of an episode's name; of DROID's, which name several files, that of the first folder."""
+    """Return the end of an episode's name; DROID's identities name several files, of which the first one is used."""
     short = name.split("--", maxsplit=1)[0].removesuffix("/recordings/MP4").rstrip("/")
     return short if len(short) <= _MAX_NAME_LENGTH else f"...{short[-_MAX_NAME_LENGTH:]}"
 
@@ -289,7 +289,7 @@ class ValidationStrip:
             self._frames = to_display_frames(frames_for_display(self._dataset, batch, row), world_model.image_size)
         decoder, latents = self._decoder.to(device).decoder, clip.latents.to(device)
         actions, states = (values[0].double().cpu().numpy() for values in (clip.actions, clip.states))
-        start = Start.of(replace(clip, latents=latents), self._dataset.spaces.state)
+        start = Start.from_batch(replace(clip, latents=latents), self._dataset.spaces.state)
         world_model.eval()
 
         def predict(name: str) -> DecodedRollout:

@@ -239,7 +239,7 @@ def _encode_split(setup: Setup, split: Split, reporter: Reporter, stop: StopRequ
 
     missing = [entry for entry in frames if not files.is_done(entry.episode, entry.camera)]
     encode_files(setup.dataset, missing, setup.encoder, files, progress, lossless_images=True)
-    pairs = FramePairs.of(setup.dataset, frames, files)
+    pairs = FramePairs.from_files(setup.dataset, frames, files)
     if frames and not len(pairs):
         raise InputError(where=setup.config.data.path, found=f"no readable {split} frame", needed="one or more")
     return pairs

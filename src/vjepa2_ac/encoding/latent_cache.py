@@ -203,7 +203,7 @@ class LatentCache:
         """Return the same data set, with the same clips in the same order, read as latents from this cache.
 
         Raises:
-            InputError: The cache is not finished; if it was not begun, names how other caches in the folder differ.
+            InputError: The cache is not finished. If it was not started, the error names the most similar other cache.
         """
         if self.is_begun:
             return open_cached_latents(self.dataset, self.folder)

@@ -184,7 +184,7 @@ def imagine_clip(
     rollouts: list[DecodedRollout] = []
     with accelerator.autocast():
         latents = encode_batch(models.world_model, batch, device=accelerator.device)
-        start, states = Start.of(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
+        start, states = Start.from_batch(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
         for name, actions in chosen.items():
             for model in models.evaluated_models:
                 with model.prediction_context():

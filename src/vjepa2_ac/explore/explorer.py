@@ -169,9 +169,9 @@ class Explorer:
     def get_observation(self, episode: int, step: int) -> Observation:
         """Return the recorded observation at a control step."""
         last = self.get_num_steps(episode) - 1 - self.stride
-        return (
-            self._cached_pair(episode, step)[0] if step <= last else self._cached_pair(episode, step - self.stride)[1]
-        )
+        if step <= last:
+            return self._cached_pair(episode, step)[0]
+        return self._cached_pair(episode, step - self.stride)[1]
 
     def get_recorded_observations(self, position: RolloutPosition) -> list[Observation | None]:
         """Return the recorded observations at the start and after each action.
@@ -402,7 +402,7 @@ class Search:
 
         Raises:
             InputError: The config has no limits of actions.
-            SearchCancelledError: It was cancelled.
+            SearchCancelledError: The computation was cancelled.
         """
         around = torch.tensor([list(action)], dtype=torch.float32)
         with self._open_cost(model_index, position, goal) as cost:

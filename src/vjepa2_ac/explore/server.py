@@ -49,9 +49,9 @@ _MAX_PAGES = 8  # pages that may be open at the same time
 class _Client:
     """One page: its pending request, and whether a newer request has replaced the running one."""
 
-    waiting: PageRequest | None = None
-    arrived: asyncio.Event = field(default_factory=asyncio.Event)
-    replaced: threading.Event = field(default_factory=threading.Event)
+    pending: PageRequest | None = None
+    has_request: asyncio.Event = field(default_factory=asyncio.Event)
+    is_replaced: threading.Event = field(default_factory=threading.Event)
 
 
 class ExploreServer:
@@ -107,11 +107,9 @@ class ExploreServer:
             )
         if path == "/socket":
             is_same_origin = get_single_header(request, "Origin") == f"http://{host}"
-            return (
-                None
-                if is_same_origin
-                else connection.respond(status.FORBIDDEN, "connections from pages of other servers are not accepted\n")
-            )
+            if is_same_origin:
+                return None
+            return connection.respond(status.FORBIDDEN, "connections from pages of other servers are not accepted\n")
         if path not in _FILES:
             return connection.respond(status.NOT_FOUND, "not found\n")
         return _make_file_response(connection, *_FILES[path])
@@ -131,7 +129,7 @@ class ExploreServer:
                         await connection.send(error_message)
         finally:
             self._pages -= 1
-            client.replaced.set()
+            client.is_replaced.set()
             answering.cancel()
             for error in await asyncio.gather(answering, return_exceptions=True):
                 if isinstance(error, Exception) and not isinstance(error, closed.exceptions.ConnectionClosed):
@@ -140,20 +138,20 @@ class ExploreServer:
     def _set_request(self, client: _Client, message: str | bytes) -> bytes | None:
         """Set the pending request of a page, which cancels the running one; return an error if it is invalid."""
         try:
-            client.waiting = read_request(message)
+            client.pending = read_request(message)
         except InputError as error:
             return encode_message("error", None, {"text": str(error)})
-        client.replaced.set()
-        client.arrived.set()
+        client.is_replaced.set()
+        client.has_request.set()
         return None
 
     async def _answer_all(self, connection: Any, client: _Client) -> None:
         loop = asyncio.get_running_loop()
         await connection.send(await loop.run_in_executor(self._computing, self._views.make_hello))
         while True:
-            await client.arrived.wait()
-            client.arrived.clear()
-            request, client.replaced = client.waiting, threading.Event()
+            await client.has_request.wait()
+            client.has_request.clear()
+            request, client.is_replaced = client.pending, threading.Event()
             if request is None:
                 continue
 
@@ -162,7 +160,7 @@ class ExploreServer:
                 asyncio.run_coroutine_threadsafe(connection.send(message), loop)
 
             answer = await loop.run_in_executor(
-                self._computing, self._answer_request, request, progress, client.replaced.is_set
+                self._computing, self._answer_request, request, progress, client.is_replaced.is_set
             )
             if answer is not None:
                 await connection.send(answer)

@@ -59,7 +59,7 @@ class Views:
     search: Search
 
     @classmethod
-    def of(cls, subject: str, explorer: Explorer, config: Config) -> Views:
+    def create(cls, subject: str, explorer: Explorer, config: Config) -> Views:
         """Return the views of an explorer. On a CPU the search is small, unless the config changes `planning`."""
         planning = config.planning
         if explorer.device.type == "cpu" and planning == PlanningConfig(limits=planning.limits):
@@ -76,7 +76,7 @@ class Views:
 
         Raises:
             InputError: There is no such position, goal or model.
-            SearchCancelledError: It was cancelled.
+            SearchCancelledError: The search or simulation was cancelled.
         """
         if request.kind == "episode":
             return self._answer_episode(request)

@@ -69,10 +69,10 @@ def find_gripper_key_frames(states: States, rule: StillRule | None = None) -> tu
     names: dict[int, str] = {}  # by frame
     changes = _find_gripper_changes(states[:, GRIPPER])
     for begin, end in changes:
-        closes = states[end, GRIPPER] > states[begin, GRIPPER]
+        is_closing = states[end, GRIPPER] > states[begin, GRIPPER]
         if begin >= rule.min_distance:
-            names.setdefault(begin, "before closing" if closes else "before opening")
-        names[_find_end_of_change(states, begin, end)] = "closed" if closes else "opened"
+            names.setdefault(begin, "before closing" if is_closing else "before opening")
+        names[_find_end_of_change(states, begin, end)] = "closed" if is_closing else "opened"
     for begin in _find_stops(states, rule.min_rest):
         is_near = [abs(begin - frame) < rule.min_distance for frame in (0, last, *names)]
         if not any(is_near) and not any(first <= begin <= end for first, end in changes):
@@ -134,11 +134,11 @@ def add_frames_between(keys: Sequence[KeyFrame], step: int, name: str = "on the 
         step: Number of frames from one goal to the next.
         name: Name of the additional key frames; `{}` is replaced by the frame's number.
     """
-    with_between: list[KeyFrame] = []
+    all_frames: list[KeyFrame] = []
     for before, key in itertools.pairwise((KeyFrame(0, "start"), *keys)):
         between = [frame for frame in range(before.frame + step, key.frame, step) if 2 * (key.frame - frame) >= step]
-        with_between += [*(KeyFrame(frame, name.format(frame)) for frame in between), key]
-    return tuple(with_between)
+        all_frames += [*(KeyFrame(frame, name.format(frame)) for frame in between), key]
+    return tuple(all_frames)
 
 
 def select_every_nth_frame(frames: int, step: int) -> tuple[KeyFrame, ...]:

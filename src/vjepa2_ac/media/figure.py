@@ -90,7 +90,7 @@ def new_figure(width: float, height: float, **options: Any) -> Figure:
 
 
 def figure_to_svg(draw: Callable[..., None], width: float, height: float, *arguments: Any) -> str:
-    """Call `draw(figure, *given)` on a figure (size in inches) and return it as an SVG data: URL, reproducibly."""
+    """Call `draw(figure, *arguments)` on a figure (size in inches) and return it as an SVG data: URL, reproducibly."""
     style = {"font.size": 9, "legend.fontsize": 8, "svg.fonttype": "none", "svg.hashsalt": "vjepa2-ac"}
     text = io.StringIO()
     with figure_style(style), warnings.catch_warnings():
