@@ -1,7 +1,8 @@
 """State and action spaces: the meaning of the numbers of a robot, their plausible ranges, and how states change.
 
-A pose has a position, a rotation and a gripper (conventions: `vjepa2_ac.episode`). For a vector, such as
-the joints of a robot, two arms or a mobile base, only the width is known. `space.position` is None for a space without a position.
+A pose has a position, a rotation and a gripper (conventions: `vjepa2_ac.episode`). For a vector, such as the
+joints of a robot, two arms or a mobile base, only the width is known. `space.position` is None for a space without a
+position.
 """
 
 from __future__ import annotations
