@@ -58,9 +58,7 @@ def of_model(metrics: dict, model: str, key: str) -> list[float]:
     return [row["value"] for row in metrics["rows"] if row["model"] == model and row["key"].startswith(key)]
 
 
-def test_evaluate_ends_with_the_result_in_words_a_picture_and_paths(
-    workshop: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluate_prints_result_image_and_paths(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", str(workshop / "lora"), *NEWEST, "--clips", "8", "--all", *FEW]) == 0
     printed = capsys.readouterr().out
     result = json.loads((workshop / "lora" / "metrics.json").read_text())
@@ -86,7 +84,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("arguments", "complaint"), WRONG.values(), ids=WRONG.keys())
-def test_wrong_input_is_one_clear_error(
+def test_wrong_input_prints_one_error(
     workshop: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], complaint: str
 ) -> None:
     assert main([word.format(here=workshop) for word in arguments]) == 2
@@ -97,7 +95,7 @@ def test_wrong_input_is_one_clear_error(
     assert not (workshop / "x").exists()
 
 
-def test_real_robot_pictures_go_the_whole_way_and_the_error_falls(shared: Path, tmp_path: Path) -> None:
+def test_training_on_real_robot_frames_lowers_the_error(shared: Path, tmp_path: Path) -> None:
     data = shared / "data/bridge_rlds/bridge_dataset/1.0.0"
     config = str(ROOT / "configs/bridge.yaml")
     overrides = [f"data.path={data}", f"run_dir={tmp_path / 'run'}", "training.steps=20", "validation.every=20"]
@@ -136,7 +134,7 @@ def on_an_encoder(workshop: Path) -> Path:
     return workshop
 
 
-def test_an_export_is_a_base_with_its_encoder(on_an_encoder: Path, tmp_path: Path) -> None:
+def test_export_can_be_used_as_base_model(on_an_encoder: Path, tmp_path: Path) -> None:
     assert main(["export", str(on_an_encoder / "whole"), str(tmp_path / "merged")]) == 0
     assert main(["export", str(on_an_encoder / "whole"), str(tmp_path / "official.pt"), "--to", "official"]) == 0
     run = load_subject(on_an_encoder / "whole").world_model.eval()
@@ -164,7 +162,7 @@ def test_an_export_is_a_base_with_its_encoder(on_an_encoder: Path, tmp_path: Pat
     assert json.loads((tmp_path / "hub" / "vjepa2_ac.json").read_text())["encoder_in_words"] == words
 
 
-def test_latents_of_another_frame_path_are_not_taken(on_an_encoder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_latents_of_another_frame_input_raise(on_an_encoder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = config_of_encoder(on_an_encoder, "image", {**MODEL, "encoder": {**ENCODER, "frame": "image"}})
     assert main(["train", config]) == 2
     error = capsys.readouterr().err

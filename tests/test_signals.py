@@ -49,15 +49,13 @@ def test_resume_after_a_stop_signal_is_exact(make_config, reporter, tmp_path, wh
     assert_same_run(whole_run, tmp_path / "stopped")
 
 
-def test_a_run_under_nohup_outlives_its_terminal(make_config, reporter, tmp_path, whole_run) -> None:
+def test_run_under_nohup_ignores_sighup(make_config, reporter, tmp_path, whole_run) -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     train(make_config(run_dir=str(tmp_path / "run")), signalled_reporter(reporter, 3, signal.SIGHUP))
     assert_same_run(whole_run, tmp_path / "run")
 
 
-def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order(
-    make_config, reporter, tmp_path
-) -> None:
+def test_signal_to_the_process_group_stops_run_and_workers_cleanly(make_config, reporter, tmp_path) -> None:
     changes = {"training__steps": 40, "validation__every": 40, "checkpoint__every": 40, "data__workers": 2}
     config = make_config(run_dir=str(tmp_path / "stopped"), **changes)
     (tmp_path / "config.yaml").write_text(config_as_yaml(config))
@@ -90,7 +88,7 @@ def test_a_second_signal_ends_the_process_at_once(popen, number: int) -> None:
     assert process.wait(timeout=120) == -number
 
 
-def test_a_signal_that_comes_twice_at_once_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_signal_within_half_a_second_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(signals, "SAME_WITHIN_S", 60.0)
     with stop_on_signals() as stop:
         os.kill(os.getpid(), signal.SIGTERM)
@@ -98,7 +96,7 @@ def test_a_signal_that_comes_twice_at_once_is_one(monkeypatch: pytest.MonkeyPatc
         assert stop.reason == "SIGTERM"
 
 
-def test_a_terminal_that_goes_asks_to_stop_however_often_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_sighup_requests_one_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(signals, "SAME_WITHIN_S", 0.0)
     with stop_on_signals() as stop:
         for _ in range(3):
@@ -106,7 +104,7 @@ def test_a_terminal_that_goes_asks_to_stop_however_often_it_says_so(monkeypatch:
         assert stop.reason == "SIGHUP"
 
 
-def test_signals_do_afterwards_what_they_did_before() -> None:
+def test_signal_handlers_are_restored() -> None:
     def mine(number: int, frame: object) -> None: ...
 
     signal.signal(signal.SIGTERM, mine)
@@ -118,7 +116,7 @@ def test_signals_do_afterwards_what_they_did_before() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
 
 
-def test_outside_the_main_thread_signals_are_left_alone() -> None:
+def test_signal_handlers_are_unchanged_outside_the_main_thread() -> None:
     before = signal.getsignal(signal.SIGTERM)
     seen = []
 
@@ -132,7 +130,7 @@ def test_outside_the_main_thread_signals_are_left_alone() -> None:
     assert seen == [None, before]
 
 
-def test_a_signal_while_data_do_not_come_ends_the_run_before_the_step(
+def test_signal_while_data_is_unreachable_stops_before_the_step(
     make_config, reporter, tmp_path, whole_run, monkeypatch
 ) -> None:
     """What follows equals the run that nothing disturbed: micro-batches of the step that was left are forgotten."""

@@ -50,7 +50,7 @@ def words_on_a_machine_of_skypilot(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("where", ["kubernetes", "skypilot"])
-def test_torchrun_and_train_take_what_the_file_starts_and_the_mirror_has_time(where: str, tmp_path: Path) -> None:
+def test_commands_of_the_files_are_valid_and_uploads_have_time(where: str, tmp_path: Path) -> None:
     from torch.distributed.run import config_from_args, parse_args
 
     words = words_in_a_pod() if where == "kubernetes" else words_on_a_machine_of_skypilot(tmp_path)
@@ -67,7 +67,7 @@ def test_torchrun_and_train_take_what_the_file_starts_and_the_mirror_has_time(wh
         assert (options.node_rank, launch.nproc_per_node, options.master_addr) == (1, 4, "10.0.0.1")
 
 
-def test_kubernetes_takes_the_file_and_no_misspelt_key(tmp_path: Path) -> None:
+def test_kubernetes_schema_accepts_the_file_and_rejects_a_misspelt_key(tmp_path: Path) -> None:
     words = ["--no-deps", "--target", str(tmp_path), "kubernetes-validate==1.37.0", "importlib_resources==7.1.0"]
     install(sys.executable, *words)
     (tmp_path / "wrong.yaml").write_text(KUBERNETES.read_text().replace("backoffLimit", "backofLimit"))
@@ -126,7 +126,7 @@ def newest(folder: Path, machines: str) -> Path:
 
 
 @pytest.mark.usefixtures("default_signals")
-def test_a_preempted_pod_starts_anew_elsewhere_and_the_run_is_the_one_that_nobody_disturbed(
+def test_run_with_a_preempted_pod_equals_an_uninterrupted_run(
     gcs: Gcs, make_config: Callable[..., Config], reporter, tmp_path: Path, monkeypatch
 ) -> None:
     gcs.put("bucket/other", b"1")

@@ -89,7 +89,7 @@ def test_sweep_continues_after_a_trial_with_an_invalid_config(
     assert [trial.state.name for trial in trials(sweep, tmp_path / "sweep")] == ["FAIL", "FAIL"]
 
 
-def test_an_outage_ends_the_sweep_and_its_trial_is_open(
+def test_outage_stops_the_sweep_and_keeps_its_trial_open(
     sweep: Callable[..., None], config: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(loop, "training_step", Mock(side_effect=UnreachableError(where="gs://data", found="no answer")))
@@ -98,7 +98,7 @@ def test_an_outage_ends_the_sweep_and_its_trial_is_open(
     assert [trial.state.name for trial in trials(sweep, tmp_path / "sweep")] == ["RUNNING"]
 
 
-def test_a_config_that_cannot_be_used_begins_no_trial(sweep: Callable[..., None], config: str, tmp_path: Path) -> None:
+def test_invalid_config_starts_no_trial(sweep: Callable[..., None], config: str, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="2"):
         sweep(str(tmp_path / "sweep"), "2", config, "training.stepz=3")
     assert [path.name for path in (tmp_path / "sweep").iterdir()] == []

@@ -40,7 +40,7 @@ def submit(folder: Path, run_ends_with: int, **more: str) -> tuple[int, list[str
     return done.returncode, calls.read_text().splitlines() if calls.exists() else []
 
 
-def test_every_process_learns_its_place(tmp_path: Path) -> None:
+def test_every_process_receives_its_rank_and_address(tmp_path: Path) -> None:
     status, calls = submit(tmp_path, run_ends_with=0)
     assert status == 0
     assert calls == [
@@ -51,13 +51,13 @@ def test_every_process_learns_its_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("ends_with", "status", "again"), [(75, 0, True), (2, 2, False), (137, 137, False)])
-def test_a_run_that_can_go_on_is_queued_again_and_no_other(tmp_path, ends_with: int, status: int, again: bool) -> None:
+def test_only_a_resumable_run_is_queued_again(tmp_path, ends_with: int, status: int, again: bool) -> None:
     found, calls = submit(tmp_path, ends_with)
     assert found == status
     assert (calls[-1] == "scontrol requeue 123456") == again
 
 
-def test_a_task_of_an_array_takes_its_line_of_the_grid_and_a_folder_of_its_own(tmp_path: Path) -> None:
+def test_array_task_uses_its_grid_line_and_its_own_folder(tmp_path: Path) -> None:
     grid = tmp_path / "sweep.txt"
     grid.write_bytes((ROOT / "examples/sweeps/grid.txt").read_bytes())
     runs = set()
@@ -74,7 +74,7 @@ def test_a_task_of_an_array_takes_its_line_of_the_grid_and_a_folder_of_its_own(t
 @pytest.mark.parametrize(
     ("more", "said"), [({}, "names the file of overrides"), ({"GRID": "sweep.txt"}, "sweep.txt has no line 2")]
 )
-def test_an_array_without_a_grid_or_a_line_trains_nothing(
+def test_array_without_grid_or_line_starts_no_training(
     tmp_path: Path, more: dict[str, str], said: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "sweep.txt").write_text("seed=1\n")

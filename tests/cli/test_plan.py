@@ -145,7 +145,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("more", "complaint"), WRONG.values(), ids=WRONG.keys())
-def test_wrong_input_is_one_clear_error(
+def test_wrong_input_prints_one_error(
     workshop: Path, capsys: pytest.CaptureFixture[str], more: list[str], complaint: str
 ) -> None:
     out = workshop / "nothing"

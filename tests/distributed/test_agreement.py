@@ -20,7 +20,7 @@ def start_both(config: object, tmp_path: Path, happens: str, status: int) -> lis
     return [out for out, _ in run_ranks([SCRIPT, str(path), happens], status=status)]
 
 
-def test_ranks_whose_errors_differ_in_the_last_digits_lose_patience_together(make_config, tmp_path: Path) -> None:
+def test_ranks_with_slightly_different_errors_stop_at_the_same_step(make_config, tmp_path: Path) -> None:
     """Rank 0 finds nothing better than the base, and ends after two validations; rank 1 would go on."""
     changes = {"training__patience": 2, "checkpoint__keep_best": "error", "validation__every": 1}
     start_both(make_config(**changes), tmp_path, "measures_otherwise", status=0)
@@ -43,7 +43,7 @@ def test_error_of_one_rank_is_raised_in_both(make_config, tmp_path: Path, happen
         assert found in said
 
 
-def test_a_command_of_several_processes_prints_an_error_once(make_config, tmp_path: Path) -> None:
+def test_error_in_several_processes_is_printed_once(make_config, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run/thesis.tex").write_text("years of work")
     path = tmp_path / "config.yaml"
@@ -52,7 +52,7 @@ def test_a_command_of_several_processes_prints_an_error_once(make_config, tmp_pa
     assert ["other things in it" in err for err in said] == [True, False]
 
 
-def test_the_share_of_broken_episodes_is_that_of_all_ranks_together(make_config, tmp_path: Path) -> None:
+def test_limit_of_broken_episodes_applies_to_all_ranks_together(make_config, tmp_path: Path) -> None:
     config = make_config(data__broken_episodes="skip")
     for said in start_both(config, tmp_path, "each_meets_another_broken_episode", status=3):
         assert "4 of 8 episodes are broken" in said

@@ -71,7 +71,7 @@ def through(door: str, monkeypatch: pytest.MonkeyPatch, folder: Path, **training
 
 @pytest.mark.usefixtures("gpu")
 @pytest.mark.parametrize("door", DOORS)
-def test_bfloat16_that_is_only_emulated_is_refused(
+def test_emulated_bfloat16_raises(
     door: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert through(door, monkeypatch, tmp_path) == 2

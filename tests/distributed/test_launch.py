@@ -37,7 +37,7 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> Any:
         {"WORLD_SIZE": "two"},
     ],
 )
-def test_incomplete_variables_are_one_error(launched: Any, changes: dict[str, str | None]) -> None:
+def test_incomplete_launcher_variables_raise(launched: Any, changes: dict[str, str | None]) -> None:
     variables = {name: value for name, value in (VARIABLES | changes).items() if value is not None}
     launched(variables)
     with pytest.raises(InputError, match="Unset RANK and WORLD_SIZE if you did not start several") as caught:
@@ -80,7 +80,7 @@ def test_missing_processes_are_reported_while_waiting(
         ("connection refused", "Not all 4 processes joined"),
     ],
 )
-def test_processes_that_never_join_are_one_error(launched: Any, error: str, words: str) -> None:
+def test_processes_that_never_join_raise(launched: Any, error: str, words: str) -> None:
     def meet(*_: object, **__: object) -> Any:
         raise RuntimeError(error)
         yield

@@ -54,7 +54,7 @@ def errors_of(ranks: list[Rank]) -> list[str]:
     return [rank.communicate(timeout=600)[1] for rank in ranks]
 
 
-def test_a_process_killed_at_any_time_ends_all_and_fewer_resume(endless) -> None:
+def test_killed_process_ends_all_and_fewer_processes_resume(endless) -> None:
     """After 4 processes 3 go on, of which one has two micro-batches of a step; then 4 again, with the same clips."""
     drawn, run = np.random.default_rng(0), Path(endless.run_dir)
     for kill in range(KILLS):
@@ -95,7 +95,7 @@ def test_relaunched_processes_resume(make_config, tmp_path: Path, popen) -> None
     assert read_state(newest_checkpoint(run / "checkpoints")).processes == 2
 
 
-def test_an_unexpected_error_of_one_process_ends_the_others_with_one_error(make_config, tmp_path: Path) -> None:
+def test_unexpected_error_of_one_process_ends_all_with_one_error(make_config, tmp_path: Path) -> None:
     """A bug, or a library's error, in a single process: the others do not wait for it."""
     path = tmp_path / "config.yaml"
     path.write_text(config_as_yaml(make_config(training__accumulation=1)))

@@ -84,7 +84,7 @@ def test_collectives_of_a_training_step(tmp_path, without_dropout) -> None:
 @pytest.mark.parametrize(
     ("before", "now", "each"), [(1, 1, None), (1, 2, "2"), (1, 3, "1 or 2"), (2, 1, "8"), (4, 2, "8"), (2, 5, "1 or 2")]
 )
-def test_a_step_has_the_clips_that_it_had_on_any_number_of_processes(
+def test_clips_of_a_step_do_not_depend_on_the_number_of_processes(
     make_config, reporter, before: int, now: int, each: str | None
 ) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
@@ -93,7 +93,7 @@ def test_a_step_has_the_clips_that_it_had_on_any_number_of_processes(
     assert [f"{each} micro-batches of 2 in each" in note for note in reporter.notes] == [True] * (each is not None)
 
 
-def test_more_processes_than_micro_batches_are_refused(make_config, reporter) -> None:
+def test_more_processes_than_micro_batches_raise(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
     with pytest.raises(
         InputError, match=r"5 processes.*Expected at most 4 processes, because a step of this run has 8 clips"
@@ -112,7 +112,7 @@ def test_explicit_accumulation_change_is_used(make_config, reporter) -> None:
     batch_size=st.integers(1, 3),
     steps=st.integers(1, 3),
 )
-def test_every_clip_of_a_step_has_one_process(
+def test_every_clip_of_a_step_is_computed_by_one_process(
     processes: int, micro_batches_per_step: int, batch_size: int, steps: int
 ) -> None:
     """Also where the processes do not divide the micro-batches of a step: none twice, none left out, in every step."""
@@ -131,6 +131,6 @@ def test_changed_clips_per_step_resume_from_clips_done(make_config, reporter) ->
     assert read_state(newest_checkpoint(folder / "checkpoints")).clips_done == 2 * 4 + 2 * 2
 
 
-def test_fp16_on_a_cpu_is_refused(make_config, reporter) -> None:
+def test_fp16_on_a_cpu_raises(make_config, reporter) -> None:
     with pytest.raises(InputError, match="fp16 on a CPU"):
         train(make_config(training__precision="fp16", model__dtype="bfloat16"), reporter)

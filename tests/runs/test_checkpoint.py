@@ -51,7 +51,7 @@ def write(folder: Path, step: int, keep: int = 5) -> Path:
 
 @pytest.mark.parametrize("name", ["adapter/weights.bin", "optimizer.pt", "state.json", "manifest.json"])
 @pytest.mark.parametrize("fault", ["truncate", "flip", "remove"])
-def test_a_damaged_checkpoint_is_passed_over_with_a_warning(
+def test_damaged_checkpoint_is_skipped_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, fault: str
 ) -> None:
     older, newer = write(tmp_path, 10), write(tmp_path, 20)
@@ -70,7 +70,7 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_warning(
 
 
 @pytest.mark.parametrize("step", [30, 40])
-def test_what_a_killed_writer_left_behind_is_never_resumed_from_and_is_cleaned_up(tmp_path: Path, step: int) -> None:
+def test_incomplete_checkpoint_of_a_killed_writer_is_ignored_and_removed(tmp_path: Path, step: int) -> None:
     debris = tmp_path / f".writing-{checkpoint_name(30)}"
     debris.mkdir()
     write_weights(debris)
@@ -79,7 +79,7 @@ def test_what_a_killed_writer_left_behind_is_never_resumed_from_and_is_cleaned_u
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_when_every_checkpoint_is_damaged_the_run_stops_and_leaves_them(tmp_path: Path) -> None:
+def test_all_checkpoints_damaged_raises_and_keeps_them(tmp_path: Path) -> None:
     for step in (10, 20):
         (write(tmp_path, step) / "optimizer.pt").write_bytes(b"")
     with pytest.raises(InputError, match="all checkpoints are damaged \\(2 checkpoints"):
@@ -102,9 +102,7 @@ def test_a_checkpoint_without_permission_is_neither_skipped_nor_removed(tmp_path
 
 
 @pytest.mark.parametrize("code", [errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ELOOP, errno.ENOTCONN])
-def test_an_error_of_the_disk_does_not_count_as_damage(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
-) -> None:
+def test_disk_error_is_not_reported_as_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
     write(tmp_path, 10)
     newest = write(tmp_path, 20)
     opened = Path.open
@@ -131,7 +129,7 @@ def test_a_complete_checkpoint_of_another_process_is_never_replaced(tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", ["optimizer.pt", "manifest.json"])
-def test_a_pipe_in_a_checkpoint_is_damage_and_is_not_waited_for(tmp_path: Path, name: str) -> None:
+def test_pipe_in_a_checkpoint_is_damage_and_does_not_block(tmp_path: Path, name: str) -> None:
     checkpoint = write(tmp_path, 10)
     (checkpoint / name).unlink()
     os.mkfifo(checkpoint / name)
@@ -153,7 +151,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_the_best_stays_besides_the_newest_until_there_is_a_better_one(tmp_path: Path) -> None:
+def test_best_checkpoint_is_kept_until_a_better_one_is_saved(tmp_path: Path) -> None:
     for step, error in [(10, 0.9), (20, 0.7), (30, 0.8), (40, float("nan")), (50, 0.7)]:
         before = newest_checkpoint(tmp_path)
         state = replace(read_state(before), step=step) if before else RunState(step)
@@ -177,7 +175,7 @@ def manifest_of(files: dict[str, str]) -> str:
     return json.dumps({"files": files})
 
 
-def test_a_manifest_that_names_too_little_or_a_file_elsewhere_is_no_manifest(tmp_path: Path, caplog) -> None:
+def test_manifest_without_state_or_with_outside_paths_is_damage(tmp_path: Path, caplog) -> None:
     older, newer = write(tmp_path / "run", 10), write(tmp_path / "run", 20)
     files = json.loads((newer / "manifest.json").read_text())["files"]
     (tmp_path / "elsewhere").write_bytes((newer / "state.json").read_bytes())
@@ -197,7 +195,7 @@ def test_a_manifest_that_names_too_little_or_a_file_elsewhere_is_no_manifest(tmp
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
-def test_whatever_operation_fails_older_checkpoints_stay_and_nothing_half_is_left(tmp_path, monkeypatch, code) -> None:
+def test_failed_write_keeps_older_checkpoints_and_leaves_no_partial_one(tmp_path, monkeypatch, code) -> None:
     faults, error = Faults(monkeypatch), OSError(code, os.strerror(code))
     write(tmp_path / "count", 10)
     faults.set()
@@ -254,7 +252,7 @@ def files_end_at(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_disk_that_fills_up_in_any_file_is_the_users_error_and_changes_nothing(make_config, reporter) -> None:
+def test_full_disk_in_any_file_raises_and_changes_nothing(make_config, reporter) -> None:
     config = make_config(training__steps=1, checkpoint__keep_best="off")
     folder = train(config, reporter)
     run = set_up(config, reporter)
@@ -275,7 +273,7 @@ def test_a_disk_that_fills_up_in_any_file_is_the_users_error_and_changes_nothing
     [{}, {"adapter__modules_to_save": ["action_encoder"]}, {"adapter__kind": "none"}],
     ids=["lora", "heads", "none"],
 )
-def test_a_checkpoint_holds_what_is_trained_and_never_the_frozen_base(make_config, reporter, changes) -> None:
+def test_checkpoint_contains_trained_weights_and_not_the_frozen_base(make_config, reporter, changes) -> None:
     config = make_config(training__steps=1, **changes)
     checkpoint = newest_checkpoint(train(config, reporter) / "checkpoints")
     model = set_up(config, reporter).world_model
@@ -305,7 +303,7 @@ class Bomb:
         return (Path.touch, (self._mark,))
 
 
-def test_an_optimizer_file_that_would_run_code_is_refused_and_does_not(make_config, reporter, tmp_path) -> None:
+def test_optimizer_file_with_code_raises_and_is_not_executed(make_config, reporter, tmp_path) -> None:
     config = make_config(training__steps=1)
     checkpoint = newest_checkpoint(train(config, reporter) / "checkpoints")
     torch.save({"state": Bomb(tmp_path / "mark")}, checkpoint / "optimizer.pt")
@@ -332,7 +330,7 @@ def test_run_state_round_trip_keeps_every_field(tmp_path: Path) -> None:
     assert type((found.loss_scale or {})["growth_interval"]) is int
 
 
-def test_moments_that_are_compressed_or_of_an_older_form_are_not_read(tmp_path: Path) -> None:
+def test_compressed_or_legacy_optimizer_file_raises(tmp_path: Path) -> None:
     """A small file of either may take any memory."""
     with (tmp_path / "optimizer.pt").open("wb") as file:
         write_torch({"a": torch.zeros(1000)}, file)
@@ -370,7 +368,7 @@ def run(tmp_path: Path) -> Path:
         ("10", "step-00000010 (as requested)"),
     ],
 )
-def test_the_newest_the_best_and_that_of_a_step_are_found(run: Path, by: str, words: str) -> None:
+def test_checkpoints_are_selected_by_newest_best_and_step(run: Path, by: str, words: str) -> None:
     chosen = select_checkpoint(run, by)
     assert str(chosen) == words
     assert chosen.path == run / "checkpoints" / words.split(maxsplit=1)[0]
@@ -390,7 +388,7 @@ def test_reasons_of_older_files_equal_those_written_now(written: str, reason: st
 
 
 @pytest.mark.parametrize(("by", "found"), [("15", "no checkpoint of step 15"), ("bset", "--checkpoint bset")])
-def test_one_that_is_not_there_is_an_error_that_names_those_that_are(run: Path, by: str, found: str) -> None:
+def test_missing_checkpoint_raises_with_the_existing_steps(run: Path, by: str, found: str) -> None:
     with pytest.raises(
         InputError, match=rf"{found}.*\. Expected selected, newest, best or one of the steps 10, 20, 30"
     ):
@@ -404,7 +402,7 @@ def test_damaged_requested_checkpoint_raises(run: Path) -> None:
             select_checkpoint(run, by)
 
 
-def test_without_validations_there_is_no_best_and_without_checkpoints_nothing(tmp_path: Path) -> None:
+def test_selection_without_validations_or_checkpoints(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"without a complete checkpoint.*--resume"):
         select_checkpoint(tmp_path)
     write(tmp_path / "checkpoints", 10)
@@ -419,7 +417,7 @@ def test_without_validations_there_is_no_best_and_without_checkpoints_nothing(tm
      {"best_error": "low"}, {"loss_scale": [1]}, {"run_id": 3}, {"unheard_of": 3}],
     ids=str,
 )  # fmt: skip
-def test_a_state_of_other_types_is_refused_by_name(tmp_path: Path, changes: dict[str, object]) -> None:
+def test_state_with_wrong_types_raises(tmp_path: Path, changes: dict[str, object]) -> None:
     checkpoint = write(tmp_path, 10)
     (checkpoint / "state.json").write_text(json.dumps({"step": 10, "clips_done": 40} | changes))
     write_manifest(checkpoint)  # whoever can write the file can write the manifest

@@ -72,7 +72,7 @@ def test_folder_with_other_files_raises_even_with_a_lock(make_config, tmp_path) 
         check_run_folder(config)
 
 
-def test_small_files_of_a_run_that_are_none_are_no_traceback(tmp_path: Path, make_config) -> None:
+def test_invalid_small_files_of_a_run_raise_input_errors(tmp_path: Path, make_config) -> None:
     (tmp_path / "config.yaml").write_text(config_as_yaml(make_config(data__path="nowhere")))
     for text in ("[" * 20_000, '[3, {"folder": 4}, {}]'):
         (tmp_path / "environment.json").write_text(text)
@@ -101,7 +101,7 @@ def test_folder_in_use_raises_until_its_process_is_killed(tmp_path: Path) -> Non
             other.take()
 
 
-def test_a_file_system_without_locks_costs_a_warning(
+def test_file_system_without_locks_causes_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def refuse(file: object, operation: int) -> None:
@@ -113,7 +113,7 @@ def test_a_file_system_without_locks_costs_a_warning(
     assert "no file locks" in caplog.text
 
 
-def test_a_run_holds_its_folder_while_it_trains_and_gives_it_back(make_config, reporter) -> None:
+def test_run_folder_is_locked_while_training_and_released_afterwards(make_config, reporter) -> None:
     refused = []
 
     def try_to_train_too(step: int, metrics: object) -> None:
@@ -129,7 +129,7 @@ def test_a_run_holds_its_folder_while_it_trains_and_gives_it_back(make_config, r
     train(make_config(training__steps=2), other)
 
 
-def test_a_start_that_another_one_overtook_leaves_its_run_alone(make_config, reporter, monkeypatch) -> None:
+def test_start_overtaken_by_another_one_raises_and_changes_nothing(make_config, reporter, monkeypatch) -> None:
     config, restore = make_config(), loop.restore
 
     def overtaken(*arguments):
@@ -166,7 +166,7 @@ def at_home(make_config, home: Path):  # type: ignore[no-untyped-def]
     return parse_config({**values, "run_dir": "run"}, where=str(home))
 
 
-def test_only_paths_that_lead_nowhere_are_looked_for_elsewhere(at_home, home, monkeypatch) -> None:
+def test_only_missing_paths_are_resolved_from_the_folder_of_the_start(at_home, home, monkeypatch) -> None:
     (home / "caches").mkdir()
     (home / "ranges.json").write_text("{}")
     elsewhere = home.parent / "elsewhere"
@@ -215,7 +215,7 @@ def test_every_url_of_a_config_is_listed_with_its_key() -> None:
     assert list_remote_locations(parse_config(here, where="")) == []
 
 
-def test_a_run_that_leads_elsewhere_says_so_before_it_goes_there(
+def test_remote_locations_of_a_run_are_printed_before_they_are_used(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -246,7 +246,7 @@ OLDER = {
 OPEN_REMOTE = "vjepa2_ac.runs.open_run.open_remote"
 
 
-def test_a_new_folder_is_made_and_locked_when_the_run_begins_and_not_before(make_config, reporter) -> None:
+def test_new_run_folder_is_created_and_locked_only_when_the_run_begins(make_config, reporter) -> None:
     config = make_config()
     folder = Path(config.run_dir)
     with open_run(config, reporter) as opened:
@@ -288,7 +288,7 @@ def test_folder_is_locked_before_remote_access_and_not_by_a_check(
     assert into is None or not into.parent.exists()
 
 
-def test_the_stride_that_a_run_has_chosen_is_the_one_of_its_next_start(make_config, reporter) -> None:
+def test_next_start_uses_the_calibrated_stride(make_config, reporter) -> None:
     config = make_config(data__stride="auto")
     with open_run(config, reporter) as opened:
         assert opened.config.data.stride == "auto"
@@ -297,7 +297,7 @@ def test_the_stride_that_a_run_has_chosen_is_the_one_of_its_next_start(make_conf
         assert opened.config.data.stride == 3
 
 
-def test_an_older_run_keeps_its_drawn_splits_unless_the_config_says_otherwise(make_config, reporter) -> None:
+def test_older_run_keeps_its_drawn_splits_unless_the_config_sets_them(make_config, reporter) -> None:
     data = {"path": make_config().data.path, "frames": 4, "stride": 2}
     config = make_config(replay={"data": data})
     with open_run(config, reporter) as opened:

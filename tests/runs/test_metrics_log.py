@@ -19,7 +19,7 @@ def steps(folder: Path) -> list[int]:
     return [row["step"] for row in read_metrics_log(folder / "metrics.jsonl")]
 
 
-def test_steps_that_will_be_done_again_are_dropped_on_resume(tmp_path: Path) -> None:
+def test_rows_of_repeated_steps_are_removed_on_resume(tmp_path: Path) -> None:
     with MetricsLog(tmp_path, first_step=0) as log:
         for step in range(6):
             log.write("train", step, {"loss": 0.5})
@@ -28,7 +28,7 @@ def test_steps_that_will_be_done_again_are_dropped_on_resume(tmp_path: Path) -> 
     assert steps(tmp_path) == [0, 1, 2, 3, 4]
 
 
-def test_lines_left_by_halves_and_what_is_no_row_are_dropped(tmp_path: Path) -> None:
+def test_incomplete_and_invalid_rows_are_removed(tmp_path: Path) -> None:
     rows = [b'{"kind": "train", "step": 1}', b"\x00\xff\xfe", b"[" * 20_000, b'{"step": 3}', b'{"kind": "tra']
     (tmp_path / "metrics.jsonl").write_bytes(b"\n".join(rows))
     with MetricsLog(tmp_path, first_step=5):
@@ -36,7 +36,7 @@ def test_lines_left_by_halves_and_what_is_no_row_are_dropped(tmp_path: Path) -> 
     assert steps(tmp_path) == [1]
 
 
-def test_rows_are_on_the_disk_before_the_checkpoint_after_them(make_config, reporter, monkeypatch) -> None:
+def test_rows_are_synced_before_the_next_checkpoint(make_config, reporter, monkeypatch) -> None:
     """Else a power cut could leave a run that goes on behind rows that it does not have."""
     flushed: list[str] = []
     real = os.fsync
@@ -84,9 +84,7 @@ def full_from(disk: FullDisk, reporter, at: int):
     return reporter
 
 
-def test_a_run_that_cannot_write_its_record_writes_its_checkpoint_and_says_of_which_file(
-    make_config, reporter, tmp_path, monkeypatch
-) -> None:
+def test_unwritable_metrics_log_raises_after_saving_a_checkpoint(make_config, reporter, tmp_path, monkeypatch) -> None:
     disk, quiet = FullDisk(monkeypatch), type(reporter)()
     config = make_config(checkpoint__every=100, checkpoint__keep_best=False)
     with pytest.raises(InputError, match=r"metrics\.jsonl: .*No space left on device.*The checkpoint of this step is"):
@@ -114,7 +112,7 @@ def test_run_continues_with_all_metrics_after_a_checkpoint_frees_disk_space(
     assert_same_run(whole_run, tmp_path / "run")
 
 
-def test_a_flush_that_failed_is_not_taken_for_done_when_the_next_one_is(tmp_path: Path, monkeypatch) -> None:
+def test_failed_flush_raises_although_the_next_one_succeeds(tmp_path: Path, monkeypatch) -> None:
     """The system may have forgotten what it was to write."""
     real, failures = os.fsync, [OSError(errno.EIO, "Input/output error")]
 
@@ -133,7 +131,7 @@ def test_a_flush_that_failed_is_not_taken_for_done_when_the_next_one_is(tmp_path
             checkpoint()
 
 
-def test_what_json_cannot_hold_becomes_null(tmp_path: Path) -> None:
+def test_non_finite_values_become_null(tmp_path: Path) -> None:
     with MetricsLog(tmp_path, first_step=0) as log:
         log.write("train", 1, {"loss": float("nan")})
     assert next(read_metrics_log(tmp_path / "metrics.jsonl"))["loss"] is None

@@ -67,7 +67,7 @@ def place(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     }[request.param]  # fmt: skip
 
 
-def test_a_run_is_copied_to_any_kind_of_place_its_owner_first_and_the_manifest_last(
+def test_upload_starts_with_the_state_and_ends_with_the_manifest(
     run: Path, place: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     write(run, 10)
@@ -85,7 +85,7 @@ def test_a_run_is_copied_to_any_kind_of_place_its_owner_first_and_the_manifest_l
 
 
 @pytest.mark.parametrize("sent_before", [0, 2, 4, 7])
-def test_what_was_sent_before_a_break_is_not_sent_again(
+def test_files_uploaded_before_an_interruption_are_not_uploaded_again(
     bucket: Gcs, run: Path, sent_before: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(run, 10)
@@ -109,7 +109,7 @@ def test_what_was_sent_before_a_break_is_not_sent_again(
 
 
 @pytest.mark.usefixtures("bucket")
-def test_files_of_another_checkpoint_by_the_same_name_are_not_taken_for_its_own(run: Path) -> None:
+def test_files_of_a_different_checkpoint_with_the_same_name_are_replaced(run: Path) -> None:
     first = write(run, 10)
     send(run)
     shutil.rmtree(first)
@@ -118,7 +118,7 @@ def test_files_of_another_checkpoint_by_the_same_name_are_not_taken_for_its_own(
     assert content(f"{PLACE}/checkpoints/{checkpoint_name(10)}") == content(run / "checkpoints" / checkpoint_name(10))
 
 
-def test_the_same_are_kept_there_as_here(bucket: Gcs, run: Path) -> None:
+def test_remote_folder_keeps_the_same_checkpoints_as_the_run_folder(bucket: Gcs, run: Path) -> None:
     mirror, state = mirror_of(run), RunState(0)
     for step, error in [(10, 0.9), (20, 0.5), (30, 0.8), (40, 0.7), (50, 0.6), (60, 0.6)]:
         state = replace(state, step=step).with_validation(error)
@@ -133,7 +133,7 @@ def test_the_same_are_kept_there_as_here(bucket: Gcs, run: Path) -> None:
     assert not [name for name in bucket.names("bucket") if checkpoint_name(10) in name or UPLOADING in name]
 
 
-def test_what_was_left_by_halves_goes_and_what_is_further_on_stays(bucket: Gcs, run: Path) -> None:
+def test_incomplete_remote_checkpoints_are_removed_and_later_ones_kept(bucket: Gcs, run: Path) -> None:
     for step in (10, 90):
         bucket.put(f"bucket/run/checkpoints/{checkpoint_name(step)}/state.json", b'{"run_id": "mine"}')
     bucket.put(f"bucket/run/checkpoints/{checkpoint_name(5)}/optimizer.pt", b"?")
@@ -206,9 +206,7 @@ def test_upload_that_exceeds_its_time_is_reported_and_abandoned(
 
 
 @pytest.mark.usefixtures("bucket")
-def test_in_the_end_the_newest_is_sent_instead_of_the_one_that_was_on_its_way(
-    run: Path, gate: Callable[[str], Gate]
-) -> None:
+def test_finish_cancels_an_older_upload_and_uploads_the_newest(run: Path, gate: Callable[[str], Gate]) -> None:
     held = gate("weights")
     write(run, 10)
     mirror = mirror_of(run, remote_every_minutes=30.0)
@@ -222,7 +220,7 @@ def test_in_the_end_the_newest_is_sent_instead_of_the_one_that_was_on_its_way(
 
 
 @pytest.mark.usefixtures("bucket")
-def test_a_place_of_another_run_is_never_written(run: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_remote_folder_of_another_run_is_never_written(run: Path, caplog: pytest.LogCaptureFixture) -> None:
     write(run, 10)
     send(run)
     before = content("gs://bucket")
@@ -253,7 +251,7 @@ def test_without_hard_links_a_checkpoint_is_copied(run: Path) -> None:
 
 
 @pytest.mark.usefixtures("bucket", "_no_links")
-def test_a_newest_checkpoint_without_permission_is_reported_and_no_older_one_is_sent_in_its_place(
+def test_unreadable_newest_checkpoint_is_reported_and_no_older_one_uploaded(
     run: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     write(run, 10)
@@ -267,7 +265,7 @@ def test_a_newest_checkpoint_without_permission_is_reported_and_no_older_one_is_
 
 
 @pytest.mark.parametrize("name", ["/etc/x", "../x", "a/../../x", ""])
-def test_a_manifest_there_names_no_file_outside_its_folder(bucket: Gcs, tmp_path: Path, name: str) -> None:
+def test_remote_manifest_with_outside_paths_is_damage(bucket: Gcs, tmp_path: Path, name: str) -> None:
     manifest = json.dumps({"files": {name: "0"}}).encode()
     bucket.put(f"bucket/run/checkpoints/{checkpoint_name(10)}/manifest.json", manifest)
     problem = RemoteCheckpoints(PLACE).download(checkpoint_name(10), tmp_path / "copy")
@@ -290,7 +288,7 @@ def go_on(run: Path, mirror: Mirror, *steps: int, **how: Any) -> None:
     ("status", "match"),
     [(403, "POST /upload/"), (403, "DELETE"), (401, ""), (507, "POST /upl")],
 )
-def test_a_bucket_that_is_closed_for_a_while_costs_one_warning(
+def test_outage_of_a_bucket_causes_one_warning(
     bucket: Gcs, run: Path, status: int, match: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     mirror = mirror_of(run)
@@ -308,7 +306,7 @@ def test_a_bucket_that_is_closed_for_a_while_costs_one_warning(
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
-def test_a_place_without_room_may_have_some_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+def test_upload_to_a_full_disk_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
     monkeypatch.setattr(transfer.tempfile, "TemporaryFile", Mock(side_effect=OSError(code, "No room")))
     with pytest.raises(UnreachableError) as caught:
         storage.check_writable(str(tmp_path))
@@ -316,7 +314,7 @@ def test_a_place_without_room_may_have_some_later(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
-def test_halves_of_a_full_disk_do_not_keep_it_full(
+def test_incomplete_checkpoints_on_a_full_disk_are_removed(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, code: int
 ) -> None:
     place, room = tmp_path / "disk", int(4.2 * CHECKPOINT)  # three that are kept, and one that comes
@@ -414,7 +412,7 @@ def test_only_one_of_two_simultaneous_starts_keeps_the_remote_folder(
     assert json.loads(storage.read_bytes(name))["run_id"] == "that"
 
 
-def test_who_removed_the_list_of_starts_took_the_place_from_nobody(machine, disk: str, caplog) -> None:
+def test_removed_list_of_starts_does_not_stop_uploads(machine, disk: str, caplog) -> None:
     first = machine("one")
     first.go_on(10)
     (Path(disk) / ENVIRONMENT).unlink()

@@ -51,7 +51,7 @@ def local(config: Config) -> Path:
     return Path(config.run_dir)
 
 
-def test_an_empty_place_is_tried_and_left_empty(bucket: Gcs, config: Config) -> None:
+def test_empty_remote_folder_is_tested_and_left_empty(bucket: Gcs, config: Config) -> None:
     assert open_remote(config, SILENT) == config
     assert bucket.names("bucket") == ["other"]
     assert [r.target.split("/")[0] for r in bucket.requests if "write-check" in r.target] == ["POST ", "DELETE "]
@@ -76,7 +76,7 @@ def test_new_machine_downloads_the_newest_checkpoint_and_the_small_files(bucket:
 
 
 @pytest.mark.parametrize("damage", ["flip", "remove", "manifest"])
-def test_a_damaged_checkpoint_there_is_passed_over_by_name(
+def test_damaged_remote_checkpoint_is_skipped_with_a_warning(
     bucket: Gcs, config: Config, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     run_there(bucket, config, 10, 20)
@@ -97,7 +97,7 @@ def test_a_damaged_checkpoint_there_is_passed_over_by_name(
 
 @pytest.mark.parametrize("name", ["state.json", "manifest.json", "optimizer.pt"])
 @pytest.mark.parametrize("here", [None, 10])
-def test_a_checkpoint_there_without_permission_stops_the_start_and_is_kept(
+def test_unreadable_remote_checkpoint_raises_and_is_kept(
     make_config: MakeConfig, tmp_path: Path, name: str, here: int | None
 ) -> None:
     place = tmp_path / "disk/run"
@@ -116,7 +116,9 @@ def test_a_checkpoint_there_without_permission_stops_the_start_and_is_kept(
 
 
 @pytest.mark.parametrize(("here", "elsewhere", "taken"), [(10, 20, 20), (20, 10, 20), (20, 20, 20)])
-def test_the_further_one_is_taken(bucket: Gcs, config: Config, here: int, elsewhere: int, taken: int) -> None:
+def test_run_resumes_from_the_later_of_local_and_remote_checkpoint(
+    bucket: Gcs, config: Config, here: int, elsewhere: int, taken: int
+) -> None:
     run_there(bucket, config, elsewhere)
     write(local(config), here)
     (local(config) / "config.yaml").write_text(config_as_yaml(config))
@@ -125,7 +127,7 @@ def test_the_further_one_is_taken(bucket: Gcs, config: Config, here: int, elsewh
     assert bool(bucket.bytes_read("optimizer.pt")) == (elsewhere > here)
 
 
-def test_another_config_is_refused_as_if_it_were_on_this_machine(bucket: Gcs, config: Config) -> None:
+def test_remote_run_with_another_config_raises(bucket: Gcs, config: Config) -> None:
     run_there(bucket, config, 10)
     training = config.training.model_copy(update={"learning_rate": 0.5})
     other = config.model_copy(update={"training": training})
@@ -136,7 +138,7 @@ def test_another_config_is_refused_as_if_it_were_on_this_machine(bucket: Gcs, co
     assert newest_checkpoint(local(config) / "checkpoints") is not None
 
 
-def test_another_runs_place_is_refused(bucket: Gcs, config: Config) -> None:
+def test_remote_folder_of_another_run_raises(bucket: Gcs, config: Config) -> None:
     run_there(bucket, config, 10, run_id="other")
     before = bucket.names("bucket")
     write(local(config), 20)
@@ -147,7 +149,7 @@ def test_another_runs_place_is_refused(bucket: Gcs, config: Config) -> None:
     assert bucket.names("bucket") == before
 
 
-def test_a_place_that_cannot_be_reached_is_a_warning(
+def test_unreachable_remote_folder_causes_a_warning(
     bucket: Gcs, config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
     bucket.fail_next(503, times=99)
@@ -158,7 +160,7 @@ def test_a_place_that_cannot_be_reached_is_a_warning(
     assert "the state on this machine (no checkpoint)" in caplog.text
 
 
-def test_what_is_seen_there_and_cannot_be_fetched_is_not_done_again_from_the_start(
+def test_failed_download_of_a_remote_checkpoint_raises(
     bucket: Gcs, config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
     run_there(bucket, config, 20)
@@ -171,9 +173,7 @@ def test_what_is_seen_there_and_cannot_be_fetched_is_not_done_again_from_the_sta
     assert f"the state on this machine (step 10; {checkpoint_name(20)} is newer)" in caplog.text
 
 
-def test_a_run_without_a_complete_checkpoint_there_that_cannot_be_fetched_is_not_started_again(
-    bucket: Gcs, config: Config
-) -> None:
+def test_failed_download_of_a_remote_run_without_checkpoint_raises(bucket: Gcs, config: Config) -> None:
     run_there(bucket, config, 20)
     RemoteCheckpoints(PLACE).remove(checkpoint_name(20))
     bucket.put(f"bucket/run/checkpoints/{checkpoint_name(20)}/state.json", b'{"run_id": "mine", "step": 20}')
@@ -195,7 +195,7 @@ def test_remote_folder_without_permission_raises_with_a_fix(
         open_remote(config, SILENT)
 
 
-def test_a_bucket_that_does_not_exist_is_an_error(bucket: Gcs, make_config: Callable[..., Config]) -> None:
+def test_missing_bucket_raises(bucket: Gcs, make_config: Callable[..., Config]) -> None:
     assert bucket.names("bucket")
     with pytest.raises(
         InputError, match=r"bucket buckett does not exist\..*check its name\. Or set another checkpoint.remote"
@@ -204,13 +204,13 @@ def test_a_bucket_that_does_not_exist_is_an_error(bucket: Gcs, make_config: Call
 
 
 @pytest.mark.parametrize("inner", ["", "mirror"])
-def test_the_runs_own_folder_is_no_mirror(make_config: Callable[..., Config], inner: str) -> None:
+def test_mirror_inside_the_run_folder_raises(make_config: Callable[..., Config], inner: str) -> None:
     folder = local(make_config())
     with pytest.raises(InputError, match="a folder outside run_dir"):
         open_remote(make_config(checkpoint__remote=str(folder / inner)), SILENT)
 
 
-def test_a_folder_is_claimed_before_anything_is_fetched_into_it(bucket: Gcs, config: Config) -> None:
+def test_run_folder_is_locked_before_a_download(bucket: Gcs, config: Config) -> None:
     """Two that start at once in a new folder: the second would put older metrics over those of the first."""
     run_there(bucket, config, 10)
     with RunLock(local(config)) as first, RunLock(local(config)) as second:
@@ -225,9 +225,7 @@ def test_a_folder_is_claimed_before_anything_is_fetched_into_it(bucket: Gcs, con
             other.take()
 
 
-def test_who_is_killed_while_fetching_fetches_again(
-    bucket: Gcs, config: Config, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_download_starts_again(bucket: Gcs, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     source, download = run_there(bucket, config, 10), storage.download
 
     def killed(source: str, target: Path) -> None:
@@ -298,7 +296,7 @@ def test_unreachable_remote_folder_causes_warnings_and_loses_no_step(
 
 
 @pytest.mark.usefixtures("bucket", "default_signals")
-def test_a_check_tries_the_place_and_leaves_nothing_there_or_here(bucket: Gcs, config_on: MakeConfig, reporter) -> None:
+def test_check_tests_the_remote_folder_and_writes_nothing(bucket: Gcs, config_on: MakeConfig, reporter) -> None:
     config = config_on("one")
     train(config, reporter, check_only=True)
     assert [r.target for r in bucket.requests if r.target.startswith("DELETE") and ".write-check-" in r.target]
@@ -316,7 +314,7 @@ def test_a_check_tries_the_place_and_leaves_nothing_there_or_here(bucket: Gcs, c
 
 
 @pytest.mark.usefixtures("bucket", "default_signals")
-def test_a_run_that_fails_sends_its_last_checkpoint(config_on: MakeConfig, reporter) -> None:
+def test_failing_run_uploads_its_last_checkpoint(config_on: MakeConfig, reporter) -> None:
     def fail() -> None:
         raise InputError(where="here", found="a loss that is not finite")
 
@@ -378,7 +376,7 @@ def test_run_killed_during_an_upload_resumes_from_the_last_complete_checkpoint(
     assert_same_run(whole_run, tmp_path / machine)
 
 
-def test_half_a_checkpoint_of_another_run_is_refused_before_the_first_step(
+def test_incomplete_remote_checkpoint_of_another_run_raises_before_the_first_step(
     config_on, reporter, monkeypatch, tmp_path: Path, place: str
 ) -> None:
     die_in_upload(config_on("this", place), reporter, monkeypatch, before_file=2)

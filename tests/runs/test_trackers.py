@@ -74,7 +74,7 @@ def warnings_in(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_metrics_come_by_name_and_lists_number_by_number() -> None:
+def test_trackers_receive_metrics_by_name_and_lists_as_numbers() -> None:
     kept = Kept()
     trackers = Trackers({"one": lambda: kept})
     trackers.log("validation", 7, {"error": 0.5, "by_horizon": [1.0, 2.0], "nothing": float("nan"), "words": "no"})
@@ -83,7 +83,7 @@ def test_metrics_come_by_name_and_lists_number_by_number() -> None:
 
 
 @pytest.mark.parametrize("opening", [failing, leaving])
-def test_one_that_cannot_be_opened_costs_one_warning(caplog, opening: Callable[[], Kept]) -> None:
+def test_tracker_that_cannot_be_opened_causes_one_warning(caplog, opening: Callable[[], Kept]) -> None:
     kept = Kept()
     trackers = Trackers({"bad": opening, "good": lambda: kept})
     trackers.log("train", 1, {"loss": 0.5})
@@ -93,7 +93,7 @@ def test_one_that_cannot_be_opened_costs_one_warning(caplog, opening: Callable[[
 
 
 @pytest.mark.parametrize("fails_in", ["log", "finish"])
-def test_one_that_fails_later_costs_one_warning(caplog, fails_in: str) -> None:
+def test_tracker_that_fails_later_causes_one_warning(caplog, fails_in: str) -> None:
     bad, good = Kept(fails_in), Kept()
     trackers = Trackers({"bad": lambda: bad, "good": lambda: good})
     for step in (1, 2):
@@ -108,7 +108,7 @@ def test_one_that_fails_later_costs_one_warning(caplog, fails_in: str) -> None:
     assert "\n" not in said
 
 
-def test_tensorboard_gets_the_numbers_and_forgets_steps_that_are_done_again(tmp_path: Path) -> None:
+def test_tensorboard_receives_metrics_and_drops_repeated_steps(tmp_path: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     config = run_config(tmp_path, tensorboard=True)

@@ -35,7 +35,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.usefixtures("nothing_is_loaded")
-def test_a_finished_run_is_left_as_it_is(make_config: MakeConfig, run: Path, reporter: SilentReporter) -> None:
+def test_train_on_a_finished_run_changes_no_file(make_config: MakeConfig, run: Path, reporter: SilentReporter) -> None:
     before = content(run)
     assert train(make_config(), reporter) == run
     assert reporter.notes == ["Training is finished after 6 steps (training.steps)."]
@@ -45,7 +45,7 @@ def test_a_finished_run_is_left_as_it_is(make_config: MakeConfig, run: Path, rep
 
 
 @pytest.mark.usefixtures("nothing_is_loaded")
-def test_a_finished_run_keeps_settings_that_decide_nothing_and_sends_what_its_mirror_lacks(
+def test_finished_run_records_irrelevant_settings_and_uploads_missing_files(
     make_config: MakeConfig, run: Path, reporter: SilentReporter, tmp_path: Path
 ) -> None:
     config = make_config(checkpoint__remote=str(tmp_path / "mirror"), checkpoint__keep=1)
@@ -65,7 +65,7 @@ def test_a_finished_run_keeps_settings_that_decide_nothing_and_sends_what_its_mi
         {"base_folder": "moved"},
     ],
 )
-def test_a_finished_run_starts_where_its_config_asks_for_more_or_reads_elsewhere(
+def test_finished_run_starts_again_with_more_steps_or_other_paths(
     make_config: MakeConfig, run: Path, reporter: SilentReporter, changes: dict[str, object]
 ) -> None:
     with pytest.raises(LoadedError):
@@ -75,9 +75,7 @@ def test_a_finished_run_starts_where_its_config_asks_for_more_or_reads_elsewhere
             train(make_config(run_dir=run, **changes), reporter)
 
 
-def test_a_run_that_is_made_longer_says_at_which_rate_it_continues(
-    make_config: MakeConfig, run: Path, reporter: SilentReporter
-) -> None:
+def test_extended_run_reports_its_learning_rate(make_config: MakeConfig, run: Path, reporter: SilentReporter) -> None:
     train(make_config(run_dir=run, training__steps=13, validation__every=100), reporter, allow_config_change=True)
     said = [note for note in reporter.notes if note.startswith("The learning rate")]
     rate = next(row["learning_rate"] for row in metrics(run) if row["kind"] == "train" and row["step"] == 7)

@@ -46,20 +46,20 @@ def counted(config: Config, clips: int = 2) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("adapter", ADAPTERS)
-def test_a_clip_is_what_pytorch_counts(adapter: str) -> None:
+def test_clip_flops_equal_pytorchs_counter(adapter: str) -> None:
     config = run_config(ADAPTERS[adapter], training__rollout_steps=3, model__dtype="float32")
     flops = clip_flops(config, SIZES)
     assert (flops.forward, flops.backward) == counted(config)
 
 
-def test_a_frame_is_what_pytorch_counts() -> None:
+def test_frame_flops_equal_pytorchs_counter() -> None:
     model = WorldModel.random(SIZES, seed=0)
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
         model.encode(torch.randn(1, 1, 3, 64, 64))
     assert frame_flops(SIZES) == counter.get_total_flops()
 
 
-def test_the_default_run_has_the_flops_that_were_worked_out_by_hand() -> None:
+def test_flops_of_the_default_run_equal_a_calculation_by_hand() -> None:
     flops = clip_flops(load_config(ROOT / "configs/default.yaml"), ModelSizes())
     assert flops.encoder == pytest.approx(8.5e12, rel=0.01)
     assert flops.predictor == pytest.approx(7.5e12, rel=0.05)

@@ -36,7 +36,7 @@ STRIPS = ["step-00000000.png", "step-00000003.png", "step-00000006.png"]
 
 
 @pytest.mark.usefixtures("drawn")
-def test_a_run_with_strips_equals_the_one_without_bit_for_bit(
+def test_run_with_image_strips_equals_a_run_without_bit_for_bit(
     make_config, reporter, whole_run, decoder, monkeypatch
 ) -> None:
     sent = []
@@ -49,7 +49,7 @@ def test_a_run_with_strips_equals_the_one_without_bit_for_bit(
     assert not np.array_equal(sent[0][3][60:], sent[2][3][60:]), "the model has learned something"
 
 
-def test_the_clip_is_the_one_with_the_most_motion_and_its_rows_are_true(make_config, reporter, decoder) -> None:
+def test_strip_shows_the_clip_with_the_most_motion(make_config, reporter, decoder) -> None:
     run = set_up(make_config(validation__decoder=decoder), reporter)
     validate(run, reporter)
     assert run.image_strip is not None
@@ -69,7 +69,7 @@ def test_the_clip_is_the_one_with_the_most_motion_and_its_rows_are_true(make_con
 
 
 @pytest.mark.parametrize("failing", ["frames_for_display", "write_atomically"])
-def test_a_strip_that_fails_costs_a_warning_and_never_the_run(
+def test_failing_strip_causes_a_warning_and_the_run_continues(
     make_config, reporter, decoder, monkeypatch, caplog, failing: str
 ) -> None:
     def fail(*_: object, **__: object) -> None:

@@ -23,7 +23,7 @@ from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.step import batches_from, training_step
 
 
-def test_a_run_that_died_and_went_on_equals_the_one_that_did_not(make_config, reporter, tmp_path, whole_run) -> None:
+def test_resumed_run_equals_an_uninterrupted_run(make_config, reporter, tmp_path, whole_run) -> None:
     config = make_config(run_dir=str(tmp_path / "broken"))
     with pytest.raises(KilledError):
         train(config, dying_reporter(type(reporter)(), 3))
@@ -39,7 +39,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_of_any_kind_that_died_and_went_on_equals_the_one_that_did_not(
+def test_resumed_run_equals_an_uninterrupted_run_for_each_training_mode(
     make_config, reporter, tmp_path, kind: str
 ) -> None:
     if kind == "8 bit":
@@ -61,7 +61,7 @@ def test_the_number_of_loader_workers_changes_nothing(make_config, reporter, tmp
     assert_same_run(tmp_path / "none", tmp_path / "two")
 
 
-def test_the_best_by_validation_is_written_kept_and_remembered(make_config, reporter, tmp_path, monkeypatch) -> None:
+def test_best_checkpoint_by_validation_is_saved_and_kept(make_config, reporter, tmp_path, monkeypatch) -> None:
     def measured(errors: object) -> dict:
         del errors
         return {"rollout_over_persistence_last": next(values)}
@@ -79,7 +79,7 @@ def test_the_best_by_validation_is_written_kept_and_remembered(make_config, repo
     assert (state.best_step, state.best_error) == (2, 0.7)
 
 
-def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporter) -> None:
+def test_accumulated_micro_batches_equal_one_large_batch(make_config, reporter) -> None:
     def gradients(batch_size: int, accumulation: int) -> dict[str, torch.Tensor]:
         config = make_config(
             training__batch_size=batch_size, training__accumulation=accumulation, adapter__dropout=0.0,
@@ -109,7 +109,7 @@ def test_training_lowers_the_loss(make_config, reporter) -> None:
     assert validations[-1]["error_over_persistence"] < 0.8 * validations[0]["error_over_persistence"]
 
 
-def test_a_base_no_better_than_persistence_is_refused(make_config, reporter) -> None:
+def test_base_model_not_better_than_persistence_raises(make_config, reporter) -> None:
     config = make_config(training__allow_weak_base=False)
     with pytest.raises(InputError, match="copying the last frame"):
         train(config, reporter)
@@ -117,7 +117,7 @@ def test_a_base_no_better_than_persistence_is_refused(make_config, reporter) -> 
     assert not Path(config.run_dir).exists(), "the config can be mended and tried again"
 
 
-def test_check_does_everything_but_writes_nothing(make_config, reporter) -> None:
+def test_check_runs_all_checks_and_writes_nothing(make_config, reporter) -> None:
     config = make_config()
     train(config, reporter, check_only=True)
     assert "All checks passed" in reporter.notes[-1]
@@ -165,13 +165,13 @@ def test_run_resumes_with_moved_data_and_refuses_other_data(make_config, reporte
     train(others, type(reporter)(), allow_config_change=True)
 
 
-def test_bf16_runs_and_keeps_what_is_trained_in_float32(make_config: object, reporter) -> None:
+def test_bf16_run_keeps_trained_weights_in_float32(make_config: object, reporter) -> None:
     config: Config = make_config(training__precision="bf16", model__dtype="bfloat16", training__steps=2)
     train(config, reporter)
     assert all(value.dtype == torch.float32 for value in trained_weights(Path(config.run_dir)).values())
 
 
-def test_a_resumed_run_still_counts_the_broken_episodes_that_it_met(make_config, reporter, monkeypatch) -> None:
+def test_resumed_run_remembers_broken_episodes(make_config, reporter, monkeypatch) -> None:
     read, config = loader.read_clip, make_config(training__steps=2, data__broken_episodes="skip")
     bad = next(batches_from(set_up(config, reporter))).episode_ids[0]
 
@@ -186,7 +186,7 @@ def test_a_resumed_run_still_counts_the_broken_episodes_that_it_met(make_config,
     assert set_up(config, reporter).dataset.broken.reasons == {bad: "here: damaged."}
 
 
-def test_a_checkpoint_is_due_by_minutes_too(make_config, reporter, tmp_path, monkeypatch) -> None:
+def test_checkpoint_is_saved_after_fifteen_minutes(make_config, reporter, tmp_path, monkeypatch) -> None:
     for seconds, written in ((0.0, [1, 2, 3]), (3600.0, [3])):
         monkeypatch.setattr(outputs, "SAVE_EVERY_S", seconds)
         keys = {"run_dir": tmp_path / str(seconds), "checkpoint__every": 100, "checkpoint__keep_best": "off"}

@@ -48,7 +48,7 @@ def test_losses_equal_the_official_code(name: str) -> None:
     assert forced.item() + rollout.item() == pytest.approx(expected["loss"], rel=1e-5)
 
 
-def test_a_rollout_longer_than_the_clip_is_refused() -> None:
+def test_rollout_longer_than_the_clip_raises() -> None:
     model, batch, _ = official("tiny")
     with pytest.raises(ValueError, match="needs 17 frames"):
         prediction_losses(model, batch, 16)
@@ -72,7 +72,7 @@ def test_other_distances_equal_pytorch(keys: dict[str, Any]) -> None:
         ({"loss": {"name": "l1", "options": {"beta": 0.5}}}, "no options of its own"),
     ],
 )
-def test_a_loss_that_makes_no_sense_is_refused(keys: dict[str, object], complaint: str) -> None:
+def test_invalid_loss_options_raise(keys: dict[str, object], complaint: str) -> None:
     with pytest.raises(ValidationError, match=complaint):
         TrainingConfig.model_validate(keys)
 
@@ -122,7 +122,7 @@ def with_gradients(model: WorldModel, losses: tuple[Tensor, Tensor]) -> list[Ten
 @pytest.mark.parametrize(
     ("adapter", "checkpointing", "extrinsics"), [(LORA, False, True), (LORA, True, False), (NONE, True, True)], ids=str
 )
-def test_losses_and_gradients_equal_those_of_computing_everything_again(
+def test_losses_and_gradients_equal_those_without_key_value_cache(
     monkeypatch: pytest.MonkeyPatch, steps: int, adapter: AdapterConfig, checkpointing: bool, extrinsics: bool
 ) -> None:
     # Float64 throughout: otherwise predictions are normalised in float32.
@@ -139,7 +139,7 @@ def test_losses_and_gradients_equal_those_of_computing_everything_again(
         assert (one - other).norm() <= 1e-12 * other.norm()  # 2e-14 was measured
 
 
-def test_dropout_draws_the_same_mask_for_teacher_forcing_whatever_follows() -> None:
+def test_dropout_mask_of_teacher_forcing_does_not_depend_on_the_rollout() -> None:
     model = trained_model(LORA.model_copy(update={"dropout": 0.5}))
     torch.manual_seed(0)
     first, _ = prediction_losses(model, clips(), 1)

@@ -32,12 +32,12 @@ def bytes_of_moments(**changes: object) -> tuple[int, int]:
     return estimate_memory(config, sizes).parts["optimizer state"], sum(kept.values())
 
 
-def test_moments_are_those_of_the_optimizer() -> None:
+def test_estimated_moments_equal_those_of_the_optimizer() -> None:
     estimate, measured = bytes_of_moments()
     assert estimate == measured
 
 
-def test_moments_in_8_bits_are_those_of_bitsandbytes() -> None:
+def test_estimated_8_bit_moments_equal_those_of_bitsandbytes() -> None:
     pytest.importorskip("bitsandbytes")
     estimate, measured = bytes_of_moments(training__optimizer="adamw_8bit")
     assert estimate == measured < bytes_of_moments()[0]
@@ -60,7 +60,7 @@ def test_memory_savings_are_suggested_only_for_a_run_that_does_not_fit() -> None
     assert suggest_memory_savings(config, sizes, 0) is None
 
 
-def test_doctor_says_whether_it_fits_and_what_of_it_is_estimated(tmp_path, capsys, monkeypatch) -> None:
+def test_doctor_prints_whether_a_run_fits_and_which_parts_are_estimates(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     path = tmp_path / "run.yaml"
     path.write_text(json.dumps(USUAL))
@@ -99,7 +99,7 @@ SHAPES = {
 
 @pytest.mark.parametrize("adapter", ADAPTERS)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_parameters_are_those_of_a_model_that_was_built(shape: str, adapter: str) -> None:
+def test_parameter_counts_equal_those_of_a_built_model(shape: str, adapter: str) -> None:
     config, sizes = run_config(ADAPTERS[adapter]), SHAPES[shape]
     model = built(config, sizes)
     counts, report = count_parameters(config, sizes), trainable_report(model)
@@ -109,7 +109,7 @@ def test_parameters_are_those_of_a_model_that_was_built(shape: str, adapter: str
     assert sorted(counts.trained_tensors) == found
 
 
-def test_parameters_of_the_released_model_are_the_known_ones() -> None:
+def test_parameter_counts_of_the_released_model() -> None:
     counts = count_parameters(run_config({"rank": 16}), ModelSizes())
     assert counts.encoder == 1_012_173_952
     assert counts.trained == 16 * 442_368

@@ -75,7 +75,7 @@ def recorded(run: Run) -> Recorder:
 
 
 @pytest.mark.parametrize("order", [lambda batches: batches, uneven], ids=["even", "uneven"])
-def test_a_captured_micro_step_learns_what_the_plain_one_learns(make_run, order) -> None:
+def test_training_with_a_captured_micro_step_equals_training_without(make_run, order) -> None:
     plain, other = (make_run() for _ in range(2))
     expected = learned(plain, order(batches_from(plain)))
     recorder = recorded(other)
@@ -85,7 +85,7 @@ def test_a_captured_micro_step_learns_what_the_plain_one_learns(make_run, order)
     assert recorder.replays == 2 * STEPS - (2 if order is uneven else 0)
 
 
-def test_a_capture_adds_to_the_gradients_that_are_there(make_run) -> None:
+def test_capture_adds_to_existing_gradients(make_run) -> None:
     run = make_run()
     run.world_model.train()
     first, second = (encode(run, batch) for batch in itertools.islice(batches_from(run), 2))
@@ -103,7 +103,7 @@ def test_a_capture_adds_to_the_gradients_that_are_there(make_run) -> None:
 
 
 @NEEDS_CUDA
-def test_a_cuda_graph_learns_what_plain_launches_learn(make_run) -> None:
+def test_training_with_a_cuda_graph_equals_training_without(make_run) -> None:
     runs = [make_run(training__device="cuda", training__cuda_graph=graph) for graph in (False, True)]
     expected, found = (learned(run, batches_from(run)) for run in runs)
     assert isinstance(runs[1].micro_step, GraphedMicroStep)
@@ -111,12 +111,12 @@ def test_a_cuda_graph_learns_what_plain_launches_learn(make_run) -> None:
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
 
 
-def test_a_graph_on_a_cpu_is_refused(make_config) -> None:
+def test_cuda_graph_on_a_cpu_raises(make_config) -> None:
     with pytest.raises(InputError, match=r"training.cuda_graph.*a CUDA device"):
         make_accelerator(make_config(training__cuda_graph=True, training__device="cpu", adapter__dropout=0.0))
 
 
 @pytest.mark.parametrize("changes", [{"training__precision": "fp16"}, {"adapter__dropout": 0.1}])
-def test_a_graph_that_would_repeat_random_numbers_or_a_loss_scale_is_refused(make_config, changes) -> None:
+def test_cuda_graph_with_dropout_or_fp16_raises(make_config, changes) -> None:
     with pytest.raises(InputError, match=r"training.cuda_graph needs adapter.dropout 0, and bf16 or fp32"):
         make_config(training__cuda_graph=True, **({"adapter__dropout": 0.0} | changes))

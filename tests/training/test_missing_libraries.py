@@ -28,9 +28,7 @@ def test_missing_libraries_are_reported_before_mirror_or_data_are_opened(
         train(config, reporter)
 
 
-def test_a_run_that_nothing_can_compile_is_refused_before_anything_is_loaded(
-    make_config, reporter, monkeypatch
-) -> None:
+def test_missing_compiler_raises_before_the_model_is_loaded(make_config, reporter, monkeypatch) -> None:
     monkeypatch.setattr(compilation, "describe_missing_compiler", lambda kind: f"no compiler for {kind}")
     with pytest.raises(InputError, match=r"training.compile.*no compiler for cpu.*training.compile=off"):
         train(make_config(training__compile="blocks", data__path="nowhere"), reporter)

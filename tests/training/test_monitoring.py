@@ -22,7 +22,7 @@ from vjepa2_ac.training.step import Update
 CPU = torch.device("cpu")
 
 
-def test_update_to_weight_is_of_all_tensors_together() -> None:
+def test_update_to_weight_covers_all_tensors() -> None:
     one, other = torch.full((2, 2), 3.0), torch.tensor([8.0])  # norm: sqrt(36 + 64) = 10
     update = Update([one, other])
     one += 0.3
@@ -46,7 +46,7 @@ def test_throughput_counts_clips_tokens_and_flops_per_second() -> None:
     assert metrics.keys() == MACHINE_METRICS
 
 
-def test_every_row_of_training_says_how_the_run_and_the_machine_are(make_config, reporter) -> None:
+def test_training_rows_contain_run_and_machine_metrics(make_config, reporter) -> None:
     stepped: dict[int, dict[str, float]] = {}
     reporter.on_step = lambda step, metrics: stepped.update({step: metrics})
     constant = {"training__schedule": "warmup_stable_decay", "training__log_every": 2}
@@ -84,7 +84,7 @@ def config(make_config: Callable[..., Config]) -> Config:
     return make_config(training__steps=100)
 
 
-def test_a_validation_that_is_worse_than_at_the_start_is_reported_once(config: Config) -> None:
+def test_validation_worse_than_the_base_model_is_reported_once(config: Config) -> None:
     found = warned(config, (0, validation(0.8)), (3, validation(0.85)), (6, validation(0.86)), (9, validation(0.7)))
     assert list(found) == [3]
     text = found[3]
@@ -95,7 +95,7 @@ def test_a_validation_that_is_worse_than_at_the_start_is_reported_once(config: C
     assert "copying" not in text
 
 
-def test_a_loss_that_rises_far_above_its_lowest_is_reported_between_validations(config: Config) -> None:
+def test_loss_far_above_its_minimum_is_reported(config: Config) -> None:
     watch = DivergenceDetector(config)
     losses = [0.3, 0.5, 0.3, 0.4, 0.3] * 4 + [0.9] * 20
     found = {step: texts for step, loss in enumerate(losses) if (texts := watch("train", step, {"loss": loss}))}
@@ -108,7 +108,7 @@ def ranking(rank: float, low: float, high: float) -> dict[str, float]:
     return {"action_ranking_error": rank, "action_ranking_error_low": low, "action_ranking_error_high": high}
 
 
-def test_a_model_that_predicts_better_and_ranks_actions_worse_is_warned_of_once(config: Config) -> None:
+def test_better_prediction_with_worse_ranking_is_reported_once(config: Config) -> None:
     start = validation(0.9) | ranking(0.03, 0.02, 0.04)
     unsure, sure = validation(0.7) | ranking(0.05, 0.039, 0.07), validation(0.6) | ranking(0.06, 0.05, 0.07)
     found = warned(config, (0, start), (3, unsure), (6, sure), (9, sure))
@@ -118,7 +118,7 @@ def test_a_model_that_predicts_better_and_ranks_actions_worse_is_warned_of_once(
     assert "although" not in warned(config, (0, start), (3, worse))[3]
 
 
-def test_a_warning_is_logged_and_shown_and_a_resumed_run_does_not_repeat_it(config: Config, reporter) -> None:
+def test_warning_is_logged_and_not_repeated_after_a_resume(config: Config, reporter) -> None:
     for step, one_step in ((0, 0.8), (3, 0.85), (6, 0.86)):  # each in a process of its own
         trackers = open_trackers(config, Path(config.run_dir), run_id="a", first_step=step)
         with DivergenceWarningLog(config, reporter, first_step=step, trackers=trackers) as log:

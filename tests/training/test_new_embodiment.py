@@ -47,7 +47,7 @@ def make_robot(make_config: MakeConfig, tmp_path: Path) -> MakeConfig:
 
 
 @pytest.mark.parametrize(("widths", "kind"), [(Widths(8, 7), "lora"), (Widths(14, 14), "none")], ids=str)
-def test_from_recordings_to_a_model_of_its_own(
+def test_new_robot_from_recordings_to_a_trained_model(
     make_robot: MakeConfig, reporter: Any, tmp_path: Path, widths: Widths, kind: str
 ) -> None:
     config = make_robot(widths, adapter__kind=kind, training__steps=2, validation__every=2)
@@ -69,7 +69,7 @@ def test_from_recordings_to_a_model_of_its_own(
         export_run(folder, tmp_path / "official.pt", "official")
 
 
-def test_a_run_with_new_heads_resumes_bit_for_bit(make_robot: MakeConfig, reporter: Any, tmp_path: Path) -> None:
+def test_resume_with_new_heads_is_bit_exact(make_robot: MakeConfig, reporter: Any, tmp_path: Path) -> None:
     whole, stopped = ({"run_dir": str(tmp_path / name), "training__steps": 4} for name in ("whole", "stopped"))
     train(make_robot(**whole), type(reporter)())
 
@@ -80,7 +80,7 @@ def test_a_run_with_new_heads_resumes_bit_for_bit(make_robot: MakeConfig, report
     assert_same_run(tmp_path / "whole", tmp_path / "stopped")
 
 
-def test_a_head_that_nothing_trains_is_refused_before_the_model_is_loaded(
+def test_untrained_new_head_raises_before_the_model_is_loaded(
     make_robot: MakeConfig, reporter: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from vjepa2_ac.training import setup
@@ -92,7 +92,7 @@ def test_a_head_that_nothing_trains_is_refused_before_the_model_is_loaded(
         train(make_robot(data__stride="auto"), reporter)
 
 
-def test_vectors_as_wide_as_poses_keep_the_heads_and_must_prove_themselves(
+def test_vectors_of_width_7_keep_the_heads_and_the_base_model_check(
     make_robot: MakeConfig, reporter: Any, tmp_path: Path
 ) -> None:
     widths = Widths(7, 7)

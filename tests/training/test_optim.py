@@ -32,7 +32,7 @@ def test_warmup_stable_decay_equals_the_official_schedule() -> None:
 
 
 @pytest.mark.parametrize(("schedule", "middle", "end"), [("cosine", 5e-4, 0.0), ("warmup_stable_decay", 1e-3, 1e-3)])
-def test_a_schedule_rises_linearly_to_the_peak_and_falls_to_the_end(schedule: str, middle: float, end: float) -> None:
+def test_schedule_warms_up_linearly_and_decays_to_the_end(schedule: str, middle: float, end: float) -> None:
     training = TrainingConfig(steps=100, warmup_steps=10, learning_rate=1e-3, schedule=schedule)
     found = [learning_rate_at(step, training) for step in (5, 10, 55, 100)]
     assert found == pytest.approx([5e-4, 1e-3, middle, end])
@@ -40,7 +40,7 @@ def test_a_schedule_rises_linearly_to_the_peak_and_falls_to_the_end(schedule: st
     assert rates == sorted(rates, reverse=True)
 
 
-def test_weight_decay_spares_biases_and_norms_and_frozen_weights_are_left_out() -> None:
+def test_weight_decay_excludes_biases_norms_and_frozen_weights() -> None:
     module = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.LayerNorm(4), torch.nn.Linear(4, 2))
     module[2].requires_grad_(requires_grad=False)
     decayed, exempt = parameter_groups(module, 0.04)
@@ -65,7 +65,7 @@ def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kinds", [(False, True)])
-def test_a_run_resumes_with_the_moments_of_a_fused_and_of_a_plain_optimizer(
+def test_resume_converts_moments_between_fused_and_plain_optimizer(
     fuse: Callable[[bool], None], kinds: tuple[bool, bool]
 ) -> None:
     training = TrainingConfig(learning_rate=1e-2)
@@ -102,7 +102,7 @@ def take_steps(module: torch.nn.Linear, optimizer: torch.optim.Optimizer, seeds:
 
 
 @pytest.mark.parametrize("changes", [{"state": {0: {"momentum": 3}}}, {}], ids=str)
-def test_moments_that_are_not_of_this_optimizer_are_refused(changes: dict[str, Any], make_config, reporter) -> None:
+def test_moments_of_another_optimizer_raise(changes: dict[str, Any], make_config, reporter) -> None:
     config = make_config(training__steps=1)
     checkpoint = newest_checkpoint(train(config, reporter) / "checkpoints")
     moments = read_torch(checkpoint / "optimizer.pt") | changes

@@ -58,7 +58,7 @@ def is_replayed(name: tuple[str, int]) -> bool:
     return int(name[0].split("episode_")[1][:4]) >= 100
 
 
-def test_the_share_is_exact_and_each_data_set_keeps_its_own_order(replaying) -> None:
+def test_replay_share_is_exact_and_the_order_of_each_data_set_is_unchanged(replaying) -> None:
     config = replaying(0.6)
     found = clips_of(config, 25)
     assert sum(map(is_replayed, found)) == 60
@@ -68,7 +68,7 @@ def test_the_share_is_exact_and_each_data_set_keeps_its_own_order(replaying) -> 
         assert own == alone
 
 
-def test_a_run_that_replays_died_and_went_on_equals_the_one_that_did_not(replaying, reporter, tmp_path) -> None:
+def test_resumed_run_with_replay_equals_an_uninterrupted_run(replaying, reporter, tmp_path) -> None:
     changes = {
         "training__steps": 4, "data__cache": "auto",
         "replay__data__cache": "auto", "data__cache_dir": str(tmp_path / "a"),
@@ -86,7 +86,7 @@ def test_a_run_that_replays_died_and_went_on_equals_the_one_that_did_not(replayi
     assert state.data[1].windows == len(open_dataset(config.replay.data).windows("train"))
 
 
-def test_a_clip_that_cannot_be_read_counts_for_its_own_data_set(replaying, monkeypatch) -> None:
+def test_unreadable_clip_counts_for_its_data_set(replaying, monkeypatch) -> None:
     config = replaying(0.5, data__broken_episodes="skip", replay__data__broken_episodes="skip")
     first, replayed = (open_dataset(one) for one in config.data_sets)
     for one in (first, replayed):
@@ -120,12 +120,12 @@ def test_a_clip_that_cannot_be_read_counts_for_its_own_data_set(replaying, monke
         ({"replay__data__nonsense": 1}, r"replay.data.nonsense: unknown key"),
     ],
 )
-def test_a_second_data_set_that_cannot_fit_is_refused_when_the_config_is_read(replaying, changes, complaint) -> None:
+def test_incompatible_replay_data_set_raises_when_the_config_is_parsed(replaying, changes, complaint) -> None:
     with pytest.raises(InputError, match=complaint):
         replaying(**changes)
 
 
-def test_a_second_data_set_takes_the_settings_of_the_first_and_writes_what_differs(tmp_path: Path) -> None:
+def test_replay_data_set_inherits_settings_and_writes_differences(tmp_path: Path) -> None:
     data = {"path": "one", "frames": 4, "camera": "wrist_left", "exclude": ["a"], "fields": {"control_rate_hz": 5.0}}
     second = {"path": "two", "stride": 2, "fields": {"gripper_open": 2.0}}
     values = {"run_dir": str(tmp_path), "model": {"base": "base"}, "data": data, "replay": {"data": second}}
@@ -142,7 +142,7 @@ def test_a_second_data_set_takes_the_settings_of_the_first_and_writes_what_diffe
     assert "fields" not in config_as_dict(parse_config(values, where=""))["replay"]["data"]
 
 
-def test_a_run_of_0_1_with_a_complete_second_section_and_removed_keys_loads(replaying, caplog) -> None:
+def test_config_of_version_0_1_with_replay_and_removed_keys_loads(replaying, caplog) -> None:
     config = replaying()
     folder = Path(config.run_dir)
     folder.mkdir()
@@ -157,9 +157,7 @@ def test_a_run_of_0_1_with_a_complete_second_section_and_removed_keys_loads(repl
     assert "data.prefetch was 4; this version always uses 2" in caplog.text
 
 
-def test_frames_of_another_size_are_refused_before_the_first_step_and_go_through_caches(
-    replaying, reporter, tmp_path
-) -> None:
+def test_other_frame_size_in_replay_raises_and_caches_are_accepted(replaying, reporter, tmp_path) -> None:
     larger = write_synthetic_droid(tmp_path / "larger", episodes=4, steps=20, size=(48, 80), first=100)
     with pytest.raises(InputError, match=r"(?s)replay.data: clips of frames of 48x65.*36x49.*data.cache"):
         train(replaying(replay__data__path=str(larger)), reporter)

@@ -32,7 +32,7 @@ def test_best_checkpoint_is_discarded_if_the_validation_has_changed(make_config,
     assert (state.best_step, state.best_error) == (4, 0.6), "0.2 was of three steps ahead"
 
 
-def test_the_best_checkpoint_stays_when_a_run_is_resumed_unchanged(make_config, reporter) -> None:
+def test_best_checkpoint_is_kept_after_an_unchanged_resume(make_config, reporter) -> None:
     now = of(make_config(checkpoint__keep_best="error"))
     known = replace(BEST, validation_settings=now)
     moved = make_config(
@@ -48,7 +48,7 @@ def test_the_best_checkpoint_stays_when_a_run_is_resumed_unchanged(make_config, 
     assert reporter.notes == []
 
 
-def test_a_rank_decides_and_the_error_between_equal_ones() -> None:
+def test_ranking_error_selects_the_best_and_rollout_error_breaks_ties() -> None:
     state = RunState(0).with_validation(0.9, 0.3)
     assert (state.best_step, state.best_ranking_error) == (0, 0.3), "the base is a candidate"
     state = replace(state, step=10)

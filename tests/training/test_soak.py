@@ -70,7 +70,7 @@ def wait_for_writing(child: Child, checkpoints: Path, times: int) -> None:
 
 @pytest.mark.parametrize("keep_best", ["off", "error"] if MANY else ["error"])
 @pytest.mark.parametrize("workers", [0, 2] if MANY else [0])
-def test_a_run_killed_many_times_is_the_run_that_was_not(
+def test_run_killed_many_times_equals_an_uninterrupted_run(
     make_config, reporter, tmp_path, nursery: Nursery, workers: int, keep_best: str
 ) -> None:
     changes = {**CHANGES, "checkpoint__keep_best": keep_best}

@@ -38,7 +38,7 @@ def taken(run: Run, batches: list[Batch]) -> tuple[Gradients, dict[str, torch.Te
 
 
 @pytest.mark.parametrize("read", [[[], [1, 2, 3]]])
-def test_clips_left_out_leave_the_mean_over_the_others(make_config, reporter, read: list[list[int]]) -> None:
+def test_skipped_clips_give_the_mean_over_the_remaining_clips(make_config, reporter, read: list[list[int]]) -> None:
     run = prepared(make_config, reporter, 4, 2)
     whole = next(training_loader(run.dataset, seed=0, batch_size=4))
     metrics, gradient = taken(run, [some_clips(whole, chosen) for chosen in read])
@@ -54,7 +54,7 @@ def test_clips_left_out_leave_the_mean_over_the_others(make_config, reporter, re
         torch.testing.assert_close(gradient[name], one, rtol=1e-4, atol=1e-7)
 
 
-def test_a_step_without_a_clip_moves_nothing_and_says_so(make_config, reporter) -> None:
+def test_step_without_clips_changes_no_weight_and_is_logged(make_config, reporter) -> None:
     run = prepared(make_config, reporter, 2, 2, data__broken_episodes="skip")
     batches = training_loader(run.dataset, seed=0, batch_size=2)
     training_step(run, batches, 1)  # the optimizer has momentum now
@@ -65,7 +65,7 @@ def test_a_step_without_a_clip_moves_nothing_and_says_so(make_config, reporter) 
     assert all(torch.equal(old, new) for old, new in zip(before, run.world_model.parameters(), strict=True))
 
 
-def test_camera_poses_go_to_the_model_that_wants_them_only(make_config, reporter) -> None:
+def test_camera_poses_are_passed_only_to_a_model_that_needs_them(make_config, reporter) -> None:
     run = prepared(make_config, reporter, 2, 1)
     batch = next(training_loader(run.dataset, seed=0, batch_size=2))
     posed = replace(batch, extrinsics=torch.ones(2, 4, 6))
@@ -83,7 +83,7 @@ def with_loss_scale(run: Run, scale: float) -> Run:
     return run
 
 
-def test_scaling_losses_by_a_power_of_two_changes_nothing(make_config, reporter) -> None:
+def test_loss_scale_of_a_power_of_two_changes_nothing(make_config, reporter) -> None:
     plain, scaled = prepared(make_config, reporter, 2, 2), prepared(make_config, reporter, 2, 2)
     with_loss_scale(scaled, 1024.0)
     rows: list[list[dict[str, float]]] = []
@@ -96,7 +96,7 @@ def test_scaling_losses_by_a_power_of_two_changes_nothing(make_config, reporter)
     assert all(torch.equal(one, other) for one, other in weights)
 
 
-def test_an_overflow_skips_the_step_and_halves_the_loss_scale(make_config, reporter) -> None:
+def test_overflow_skips_the_update_and_halves_the_loss_scale(make_config, reporter) -> None:
     run = with_loss_scale(prepared(make_config, reporter, 2, 2), 2.0**127)
     batches = training_loader(run.dataset, seed=0, batch_size=2)
     before = [parameter.detach().clone() for parameter in run.world_model.parameters()]
@@ -108,7 +108,7 @@ def test_an_overflow_skips_the_step_and_halves_the_loss_scale(make_config, repor
     assert all(state["step"] == 0 and not state["exp_avg"].any() for state in run.optimizer.state.values())
 
 
-def test_gradients_that_overflow_whatever_the_loss_scale_stop_the_run(make_config, reporter) -> None:
+def test_overflow_at_the_smallest_loss_scale_raises(make_config, reporter) -> None:
     run = with_loss_scale(prepared(make_config, reporter, 2, 1), 0.5)
     parameter = next(p for p in run.world_model.parameters() if p.requires_grad)
     parameter.register_hook(lambda gradient: gradient * math.inf)
@@ -146,7 +146,7 @@ def bad_clip(make_config: Any, reporter: Any, monkeypatch: pytest.MonkeyPatch) -
     return bad
 
 
-def test_a_loss_that_is_not_a_number_stops_the_run_and_names_the_clips(make_config, reporter, bad_clip) -> None:
+def test_nan_loss_raises_with_the_names_of_the_clips(make_config, reporter, bad_clip) -> None:
     with pytest.raises(InputError, match="not finite") as caught:
         train(make_config(), reporter)
     assert reporter.steps == []

@@ -94,14 +94,14 @@ def taken_by_pytorch(config: Config, sizes: ModelSizes) -> tuple[int, ...]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_step_takes_what_it_takes_on_a_cpu(name: str) -> None:
+def test_estimated_step_memory_equals_the_peak_on_a_cpu(name: str) -> None:
     adapter, changes, sizes = CASES[name]
     config = run_config(adapter, **changes)
     step = measure_step(config, sizes, "cpu")
     assert (step.stored, step.checkpointed) == pytest.approx(taken_by_pytorch(config, sizes), rel=TOLERANCE)
 
 
-def test_all_blocks_are_inferred_from_two_and_three(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_of_all_blocks_follows_from_two_and_three(monkeypatch: pytest.MonkeyPatch) -> None:
     config, sizes = run_config({**LORA, "dropout": 0.0}, training__rollout_steps=2), model_sizes(depth=5)
     inferred = measure_step(config, sizes)
     monkeypatch.setattr(cost_step, "_BLOCKS", (5, 5))
@@ -112,7 +112,7 @@ def test_all_blocks_are_inferred_from_two_and_three(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize(("changes", "copies"), [({}, False), (FLOAT32_BASE, True)])
-def test_norms_have_a_float32_copy_on_cuda_where_autocast_makes_one(changes: dict[str, Any], copies: bool) -> None:
+def test_norms_on_cuda_keep_a_float32_copy_under_autocast(changes: dict[str, Any], copies: bool) -> None:
     config, sizes = run_config(LORA, **changes, training__attention="per_step"), model_sizes()
     cpu, cuda = (measure_step(config, sizes, device) for device in ("cpu", "cuda"))
     assert (cuda.stored > cpu.stored) == copies

@@ -22,7 +22,7 @@ def candidates(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return strides
 
 
-def test_a_run_chooses_keeps_and_never_chooses_again(
+def test_auto_stride_is_chosen_once_and_stored(
     make_config: Make, reporter: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = make_config(data__stride="auto", training__steps=2)
@@ -38,7 +38,7 @@ def test_a_run_chooses_keeps_and_never_chooses_again(
     assert not [note for note in more.notes if "Best: stride" in note]
 
 
-def test_only_a_stride_at_which_the_runs_own_clips_fit_is_chosen(
+def test_auto_stride_is_chosen_among_strides_that_fit_the_clips(
     make_config: Make, reporter: Any, candidates: list[int]
 ) -> None:
     # 24 steps hold 12 frames at stride 2 only, though the 8 frames of a calibration at stride 3, too.

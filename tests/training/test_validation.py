@@ -80,7 +80,7 @@ def test_clips_that_cannot_be_read_are_replaced_in_the_ranking(make_config, repo
         validation.validate(run, reporter)
 
 
-def test_the_lowest_rank_is_selected_though_the_error_falls_on(make_config, reporter, ranks_are) -> None:
+def test_lowest_ranking_error_is_selected_while_the_rollout_error_decreases(make_config, reporter, ranks_are) -> None:
     ranks_are((0.9, 0.10), (0.8, 0.05), (0.7, 0.06), (0.6, 0.07), (0.5, 0.08), (0.4, 0.2), (0.3, 0.3))
     folder = train(make_config(**EVERY_STEP, checkpoint__keep=1), reporter)
     assert {path.name for path in (folder / "checkpoints").iterdir()} == {checkpoint_name(1), checkpoint_name(6)}
@@ -101,7 +101,7 @@ def test_resume_after_saving_the_base_is_exact(make_config, reporter, tmp_path, 
     assert_same_run(whole, train(halted, reporter))
 
 
-def test_a_run_without_a_better_one_ends_when_patience_does(make_config, reporter, ranks_are) -> None:
+def test_run_without_improvement_ends_after_patience(make_config, reporter, ranks_are) -> None:
     ranks_are((0.9, 0.10), (0.8, 0.05), *[(0.85, 0.06)] * 5)
     config = make_config(**EVERY_STEP, training__patience=2, checkpoint__keep_best="ranking")
     folder = train(config, reporter)
@@ -112,7 +112,7 @@ def test_a_run_without_a_better_one_ends_when_patience_does(make_config, reporte
     assert read_state(newest_checkpoint(folder / "checkpoints")).step == 3, "it has ended"
 
 
-def test_a_model_that_ignores_its_actions_is_reported_after_the_warm_up_and_at_the_end(make_config, reporter) -> None:
+def test_ignored_actions_are_reported_after_warm_up_and_at_the_end(make_config, reporter) -> None:
     sizes = {
         "image_size": 32,
         "encoder": {"width": 24, "depth": 1, "heads": 2},

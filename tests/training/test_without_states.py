@@ -33,7 +33,9 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_from_training_to_an_export(make_config: MakeConfig, reporter: Any, tmp_path: Path, base: Path) -> None:
+def test_model_without_states_from_training_to_export(
+    make_config: MakeConfig, reporter: Any, tmp_path: Path, base: Path
+) -> None:
     folder = train(make_config(model__base=str(base), adapter__modules_to_save=["action_encoder"]), reporter)
     losses = [row["loss"] for row in metrics(folder) if row["kind"] == "train"]
     assert len(losses) == 6
