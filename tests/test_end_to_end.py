@@ -1,4 +1,4 @@
-"""The whole way on the command line: record, train from scratch or on a pretrained encoder, export, adapt, evaluate."""
+"""All commands in sequence: record, train from scratch or on a pretrained encoder, export, adapt, evaluate."""
 
 import json
 from pathlib import Path
@@ -33,7 +33,7 @@ def write_config(folder: Path, name: str, **changes: object) -> str:
 
 @pytest.fixture(scope="module")
 def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set, a base made from scratch, and an adapter on it, all made by commands."""
+    """Create a data set, a base model trained from scratch and an adapter, all with commands."""
     folder = tmp_path_factory.mktemp("workshop")
     data = str(folder / "data")
     assert main(["simulate", "record", data, "--domain", "B", "--episodes", "10", "--steps", "14"]) == 0
@@ -54,7 +54,7 @@ NEWEST = ["--checkpoint", "newest"]  # not the base, which may be selected after
 
 
 def of_model(metrics: dict, model: str, key: str) -> list[float]:
-    """Return the values of the rows of a model whose key begins so."""
+    """Return the values of a model's rows whose key starts with `key`."""
     return [row["value"] for row in metrics["rows"] if row["model"] == model and row["key"].startswith(key)]
 
 
@@ -126,7 +126,7 @@ def config_of_encoder(folder: Path, name: str, model: dict[str, object] = MODEL,
 
 @pytest.fixture(scope="module")
 def on_an_encoder(workshop: Path) -> Path:
-    """The same folder, after the latents of its data and a run on them."""
+    """Return the same folder after encoding its data and training on the latents."""
     config = config_of_encoder(workshop, "whole")
     assert main(["encode", config]) == 0
     assert main(["train", config, "--check"]) == 0
@@ -145,8 +145,8 @@ def test_export_can_be_used_as_base_model(on_an_encoder: Path, tmp_path: Path) -
     latents = run.encode(frames)
     expected = run.predict(latents, numbers, numbers)
     for base in (tmp_path / "merged", tmp_path / "official.pt"):
-        told = {"base": str(base), "dtype": "float32"} | ({"sizes": sizes} if base.suffix else {})
-        model = load_base(ModelConfig.model_validate(told), seed=0)
+        values = {"base": str(base), "dtype": "float32"} | ({"sizes": sizes} if base.suffix else {})
+        model = load_base(ModelConfig.model_validate(values), seed=0)
         assert torch.equal(model.encode(frames), latents)
         assert torch.allclose(model.predict(latents, numbers, numbers), expected, atol=1e-6)
     card = json.loads((tmp_path / "merged" / "config.json").read_text())

@@ -1,4 +1,4 @@
-"""Stop signals: one ends a run where it can be resumed, two end it at once."""
+"""Stop signals: the first stops a run with a checkpoint, the second ends it immediately."""
 
 import os
 import signal
@@ -79,7 +79,7 @@ def test_signal_to_the_process_group_stops_run_and_workers_cleanly(make_config, 
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_second_signal_ends_the_process_at_once(popen, number: int) -> None:
+def test_second_signal_ends_the_process_immediately(popen, number: int) -> None:
     process = popen([sys.executable, "-c", WAITING], stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "None\n"
     process.send_signal(number)
@@ -133,7 +133,7 @@ def test_signal_handlers_are_unchanged_outside_the_main_thread() -> None:
 def test_signal_while_data_is_unreachable_stops_before_the_step(
     make_config, reporter, tmp_path, whole_run, monkeypatch
 ) -> None:
-    """What follows equals the run that nothing disturbed: micro-batches of the step that was left are forgotten."""
+    """The resumed run equals an uninterrupted one: micro-batches of the unfinished step are discarded."""
 
     def stalling(run):
         for number, batch in enumerate(batches_from(run)):

@@ -1,4 +1,4 @@
-"""Spot machines: the files for SkyPilot and Kubernetes are valid, and what they start survives preemption."""
+"""Spot machines: the files for SkyPilot and Kubernetes are valid, and their runs survive preemption."""
 
 import os
 import signal
@@ -28,7 +28,7 @@ PLACE, STEPS = "gs://bucket/run", 40
 
 
 def of_kubernetes() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """Return the service, what the job says, and what each of its pods says."""
+    """Return the service, the specification of the job, and that of its pods."""
     service, job = yaml.safe_load_all(KUBERNETES.read_text())
     return service, job["spec"], job["spec"]["template"]["spec"]
 
@@ -38,13 +38,13 @@ def words_in_a_pod() -> list[str]:
 
 
 def words_on_a_machine_of_skypilot(folder: Path) -> list[str]:
-    """Run the file's script where torchrun only notes how it was called."""
+    """Run the script of the file with a torchrun that only records its arguments."""
     (folder / "torchrun").write_text('#!/bin/bash\nprintf "%s\\n" torchrun "$@" >words\n')
     (folder / "torchrun").chmod(0o755)
     task = yaml.safe_load(SKYPILOT.read_text())
-    given = {**task["envs"], "REMOTE": PLACE, "SKYPILOT_NUM_NODES": "2", "SKYPILOT_NODE_RANK": "1"}
-    given |= {"SKYPILOT_NUM_GPUS_PER_NODE": "4", "SKYPILOT_NODE_IPS": "10.0.0.1\n10.0.0.2"}
-    environment = {**os.environ, **given, "PATH": f"{folder}:{os.environ['PATH']}"}
+    variables = {**task["envs"], "REMOTE": PLACE, "SKYPILOT_NUM_NODES": "2", "SKYPILOT_NODE_RANK": "1"}
+    variables |= {"SKYPILOT_NUM_GPUS_PER_NODE": "4", "SKYPILOT_NODE_IPS": "10.0.0.1\n10.0.0.2"}
+    environment = {**os.environ, **variables, "PATH": f"{folder}:{os.environ['PATH']}"}
     subprocess.run(["bash", "-e", "-c", task["run"]], env=environment, cwd=folder, check=True)
     return (folder / "words").read_text().splitlines()
 
@@ -83,7 +83,7 @@ def test_kubernetes_schema_accepts_the_file_and_rejects_a_misspelt_key(tmp_path:
 
 
 class Pods:
-    """The two pods of the job, on this machine: one that ends before its time starts anew, in an empty folder."""
+    """The two pods of the job, as processes; a pod that fails is started again in an empty folder."""
 
     def __init__(self, config: Path, folder: Path, chdir: Callable[[Path], None]) -> None:
         self._config, self._folder, self._chdir, self.started = str(config), folder, chdir, 0
@@ -95,17 +95,17 @@ class Pods:
         machine = self._folder / f"machine-{self.started}"
         machine.mkdir()
         self._chdir(machine)
-        given = {
+        variables = {
             "torchrun": str(ROOT / "tests/support/torchrun_forked.py"), "builtin:default": self._config,
             "checkpoint.remote=gs://my-bucket/my-run": f"checkpoint.remote={PLACE}",
             "--rdzv-endpoint=vjepa2-ac-0.vjepa2-ac:29500": f"--rdzv-endpoint=127.0.0.1:{self._port}",
         }  # fmt: skip
-        words = [given.get(word, word) for word in words_in_a_pod()]
+        words = [variables.get(word, word) for word in words_in_a_pod()]
         words[1:1] = ["--local-addr=127.0.0.1", f"--node-rank={index}"]
         return Rank(words, {**os.environ, "OMP_NUM_THREADS": "1"})
 
     def wait_until(self, happened: Callable[[], object]) -> None:
-        """Wait, and start anew whatever fails, as the job's controller does."""
+        """Wait, and restart failed pods, as the job's controller does."""
         until = time.monotonic() + 200
         while not happened():
             assert time.monotonic() < until, [one.written() for one in self.running]
@@ -146,5 +146,5 @@ def test_run_with_a_preempted_pod_equals_an_uninterrupted_run(
     stopped, done = newest(tmp_path, "machine-[12]"), newest(tmp_path, "machine-*").parent
     assert 2 <= read_state(stopped).step < STEPS
     assert done != stopped.parent
-    assert (done / stopped.name).is_dir(), "a fresh machine began where the others had stopped"
+    assert (done / stopped.name).is_dir(), "a new machine resumed from the checkpoint of the stopped ones"
     assert_equal_up_to_rounding(whole, done.parent)

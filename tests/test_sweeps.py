@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("default_signals")
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Optuna, without the databases that a study in a file does not need."""
+    """Install Optuna without database libraries, which a study in a file does not need."""
     folder = tmp_path_factory.mktemp("site")
     install(sys.executable, "--no-deps", "--target", str(folder), "optuna==5.0.0", "colorlog", "tqdm", "packaging")
     return folder
@@ -56,11 +56,11 @@ def test_stopped_sweep_resumes_with_the_open_trial(
 ) -> None:
     folder, step_of_the_loop, seen = tmp_path / "sweep", loop.training_step, []
 
-    def stopping(run: Any, *given: Any, **named: Any) -> Any:
+    def stopping(run: Any, *args: Any, **kwargs: Any) -> Any:
         seen.append(run.folder.name)
         if seen == ["000"] * 4 + ["001"] * 2:
             os.kill(os.getpid(), signal.SIGUSR1)
-        return step_of_the_loop(run, *given, **named)
+        return step_of_the_loop(run, *args, **kwargs)
 
     monkeypatch.setattr(loop, "training_step", stopping)
     with pytest.raises(SystemExit, match="75"):

@@ -1,4 +1,4 @@
-"""The script for Slurm gives every process its place, and queues the job again when the run can go on."""
+"""The Slurm script sets rank and address of every process, and requeues the job if the run can be resumed."""
 
 import os
 import subprocess
@@ -29,7 +29,7 @@ exit $RUN_ENDS_WITH
 
 
 def submit(folder: Path, run_ends_with: int, **more: str) -> tuple[int, list[str]]:
-    """Run the script as a job of two tasks, where Slurm and the run only note how they were called."""
+    """Run the script as a job of two tasks, with programs that only record their arguments."""
     for name, text in {"srun": SRUN, "scontrol": SCONTROL, "vjepa2-ac": RUN}.items():
         (folder / name).write_text(text)
         (folder / name).chmod(0o755)

@@ -209,9 +209,8 @@ def make_accelerator(config: Config) -> Accelerator:
     training, on_cpu = config.training, select_device(config.training).type == "cpu"
     _patient_group.cache_clear()
     _join_process_group("gloo" if on_cpu else "nccl")
-    AcceleratorState._reset_state(
-        reset_partial_state=False
-    )  # otherwise a second run in this process keeps the precision of the first
+    # Without this reset a second run in this process would keep the precision of the first one.
+    AcceleratorState._reset_state(reset_partial_state=False)
     precision = "no" if training.precision == "fp32" else training.precision
     timeout = InitProcessGroupKwargs(timeout=_COLLECTIVE_TIMEOUT)
     return Accelerator(mixed_precision=precision, cpu=on_cpu, kwargs_handlers=[timeout])

@@ -72,10 +72,8 @@ def guard_output() -> Iterator[Callable[[], str]]:
     Replaced streams, such as those of a test or a notebook, are not changed. Yields a function that returns the reason
     why standard output was lost; empty if none was lost, or if the reader has closed it.
     """
-    if None in (
-        sys.stdout,
-        sys.stderr,
-    ):  # otherwise the next opened file gets descriptor 1 or 2, and libraries write into it
+    # Without open descriptors 1 and 2 the next opened file would get one of them, and libraries would write into it.
+    if None in (sys.stdout, sys.stderr):
         while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
             pass
         os.close(handle)
@@ -214,15 +212,14 @@ def exit_on_signals() -> Iterator[None]:
     first = StopRequest()
 
     def end(number: int, frame: FrameType | None) -> None:
-        is_first_process = not first.number
+        is_first_signal = not first.number
         first.record(number, frame)
-        if is_first_process:
+        if is_first_signal:
             raise SignalExit(number)
 
+    numbers = [number for number in (signal.SIGTERM, HANG_UP) if signal.getsignal(number) is signal.SIG_DFL]
     try:
-        with _handled(
-            [number for number in (signal.SIGTERM, HANG_UP) if signal.getsignal(number) is signal.SIG_DFL], end
-        ):
+        with _handled(numbers, end):
             yield
     except SignalExit as received:
         exit_by_signal(received.number)

@@ -1,4 +1,4 @@
-"""The ranks of a run end together, and say the same: what one of them meets, all of them know."""
+"""The ranks of a run stop at the same step, raise the same errors and share lists of broken episodes."""
 
 from pathlib import Path
 
@@ -14,14 +14,14 @@ SCRIPT = str(ROOT / "tests/support/disagreeing_ranks.py")
 
 
 def start_both(config: object, tmp_path: Path, happens: str, status: int) -> list[str]:
-    """Start two ranks, to one of which something happens; return what each wrote."""
+    """Start two ranks, one with the fault `happens`; return the error output of each."""
     path = tmp_path / "config.yaml"
     path.write_text(config_as_yaml(config))
     return [out for out, _ in run_ranks([SCRIPT, str(path), happens], status=status)]
 
 
 def test_ranks_with_slightly_different_errors_stop_at_the_same_step(make_config, tmp_path: Path) -> None:
-    """Rank 0 finds nothing better than the base, and ends after two validations; rank 1 would go on."""
+    """Rank 0 measures no improvement and stops after two validations; rank 1 alone would continue."""
     changes = {"training__patience": 2, "checkpoint__keep_best": "error", "validation__every": 1}
     start_both(make_config(**changes), tmp_path, "measures_otherwise", status=0)
     state = read_state(newest_checkpoint(tmp_path / "run/checkpoints"))

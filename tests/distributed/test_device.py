@@ -1,4 +1,4 @@
-"""Arithmetic that a GPU lacks is refused by every entry point, slow one of a CPU told, before anything is loaded."""
+"""Unsupported precision raises in every command before loading; slow precision on a CPU causes a warning."""
 
 import importlib
 import importlib.util
@@ -17,7 +17,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.distributed import select_device
 
-DOORS = {
+COMMANDS = {
     "train": ["train", "CONFIG"],
     "encode": ["encode", "CONFIG"],
     "evaluate": ["evaluate", "no such model", "--data", "CONFIG", "--out", "out"],
@@ -34,10 +34,9 @@ UNDER_AUTOCAST = ("train", "encode", "evaluate", "calibrate", "decoder")
 
 @pytest.fixture(params=[(7, 5)])
 def gpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A machine with a GPU of this compute capability, on which nothing can be computed."""
-    importlib.import_module(
-        "peft"
-    )  # it imports bitsandbytes, whose import fails if CUDA is mocked without CUDA in torch
+    """Simulate a GPU of this compute capability that cannot execute anything."""
+    # peft imports bitsandbytes, whose import fails later: CUDA is simulated, but torch is built without it.
+    importlib.import_module("peft")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda *_, **__: True)  # it emulates
@@ -58,28 +57,28 @@ def parsed(**training: str) -> Config:
     return parse_config(values(**training), where="test")
 
 
-def through(door: str, monkeypatch: pytest.MonkeyPatch, folder: Path, **training: str) -> int:
-    if door == "simulate" and importlib.util.find_spec("mujoco") is None:
+def through(command: str, monkeypatch: pytest.MonkeyPatch, folder: Path, **training: str) -> int:
+    if command == "simulate" and importlib.util.find_spec("mujoco") is None:
         pytest.skip("MuJoCo (extra sim) is not installed")
     monkeypatch.chdir(folder)
     Path("config.yaml").write_text(yaml.safe_dump(values(**training)))
-    for name in ("no such data", "no such model"):  # of which the doors ask only whether it is there, before the device
+    for name in ("no such data", "no such model"):  # the commands check that they exist before they check the device
         Path(name).mkdir(exist_ok=True)
     Image.fromarray(np.zeros((16, 16, 3), dtype=np.uint8)).save("seen.png")
-    return main([word.replace("CONFIG", "config.yaml") for word in DOORS[door]])
+    return main([word.replace("CONFIG", "config.yaml") for word in COMMANDS[command]])
 
 
 @pytest.mark.usefixtures("gpu")
-@pytest.mark.parametrize("door", DOORS)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_emulated_bfloat16_raises(
-    door: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert through(door, monkeypatch, tmp_path) == 2
+    assert through(command, monkeypatch, tmp_path) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "Tesla T4 of compute capability 7.5" in said
     assert "8.0 or more" in said
-    assert ("training.precision: bf16" in said) == (door in UNDER_AUTOCAST)
-    assert ("Set training.precision=fp16" if door in UNDER_AUTOCAST else "Set model.dtype=float32") in said
+    assert ("training.precision: bf16" in said) == (command in UNDER_AUTOCAST)
+    assert ("Set training.precision=fp16" if command in UNDER_AUTOCAST else "Set model.dtype=float32") in said
 
 
 @pytest.mark.usefixtures("gpu")

@@ -1,4 +1,4 @@
-"""Variables of a launcher that are left in the environment give one sentence, soon."""
+"""Launcher variables that are left in the environment cause an error within seconds."""
 
 import logging
 import threading
@@ -14,7 +14,7 @@ VARIABLES = {"RANK": "0", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER
 
 @pytest.fixture
 def launched(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Set the variables of a launcher, and how the processes meet."""
+    """Return a function that sets launcher variables and replaces the rendezvous."""
 
     def launched(variables: dict[str, str], meet: Any = None) -> None:
         for name in VARIABLES:

@@ -27,7 +27,7 @@ SCRIPT = str(ROOT / "tests/support/disagreeing_ranks.py")
 
 @pytest.fixture
 def endless(make_config, tmp_path: Path):
-    """Write a config of more steps than anybody waits for, of 4 micro-batches for 4 processes."""
+    """Write a config of a run that does not end during a test, with 4 micro-batches for 4 processes."""
     changes = {"training__steps": 100_000, "training__batch_size": 1, "training__accumulation": 1}
     config = make_config(**changes, adapter__dropout=0.0, checkpoint__every=1, validation__every=1000)
     (tmp_path / "config.yaml").write_text(config_as_yaml(config))
@@ -35,7 +35,7 @@ def endless(make_config, tmp_path: Path):
 
 
 def started(config: object, processes: int) -> list[Rank]:
-    """Start processes, and wait until they have made a step of their own."""
+    """Start processes, and wait until they have completed a step."""
     run, port = Path(config.run_dir), free_port()
     before = len(steps_of(run))
     path = str(run.parent / "config.yaml")
@@ -50,12 +50,12 @@ def steps_of(run: Path) -> list[int]:
 
 
 def errors_of(ranks: list[Rank]) -> list[str]:
-    """Return what they wrote to the error stream; all have ended."""
+    """Return the error output of processes that have ended."""
     return [rank.communicate(timeout=600)[1] for rank in ranks]
 
 
 def test_killed_process_ends_all_and_fewer_processes_resume(endless) -> None:
-    """After 4 processes 3 go on, of which one has two micro-batches of a step; then 4 again, with the same clips."""
+    """After 4 processes, 3 resume, one with two micro-batches per step; then 4 again, with the same clips."""
     drawn, run = np.random.default_rng(0), Path(endless.run_dir)
     for kill in range(KILLS):
         ranks = started(endless, 4 - kill % 2)
@@ -75,7 +75,7 @@ def test_killed_process_ends_all_and_fewer_processes_resume(endless) -> None:
 
 
 def test_restarts_with_a_shared_store_raise(make_config, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They would wait for those that have ended."""
+    """Restarted processes would wait for processes that have ended."""
     monkeypatch.setenv("TORCHELASTIC_USE_AGENT_STORE", "True")
     monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "3")
     with pytest.raises(InputError, match=f"{STORE}=1"):

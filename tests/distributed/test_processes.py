@@ -35,7 +35,7 @@ def without_dropout(make_config, tmp_path):
 
 
 def test_two_processes_resumed_as_one_equal_a_single_process_run(without_dropout, reporter, tmp_path) -> None:
-    """One rank is signalled, both stop after the same step; one process goes on with all clips of a step."""
+    """One rank receives a signal, both stop after the same step, and one process resumes with all clips of a step."""
     whole = train(without_dropout("whole", training__steps=16, training__accumulation=4), type(reporter)())
     config = without_dropout("shared", training__steps=16, training__accumulation=2)
     port = free_port()
@@ -76,7 +76,7 @@ def test_two_torchrun_nodes_equal_a_single_process_run(without_dropout, reporter
 
 
 def test_collectives_of_a_training_step(tmp_path, without_dropout) -> None:
-    """Sums, gradients, broken episodes, a micro-batch that is empty for one process: in processes_together.py."""
+    """processes_together.py tests sums, gradients, broken episodes, and an empty micro-batch of one process."""
     without_dropout("pair", data__broken_episodes="skip", training__max_grad_norm=None)
     run_ranks([str(ROOT / "tests/support/processes_together.py"), str(tmp_path / "pair.yaml")])
 
@@ -115,7 +115,7 @@ def test_explicit_accumulation_change_is_used(make_config, reporter) -> None:
 def test_every_clip_of_a_step_is_computed_by_one_process(
     processes: int, micro_batches_per_step: int, batch_size: int, steps: int
 ) -> None:
-    """Also where the processes do not divide the micro-batches of a step: none twice, none left out, in every step."""
+    """This also holds if the number of micro-batches is not a multiple of the number of processes."""
     firsts = [
         list(islice(first_positions(share, batch_size, start=5), steps * len(share.micro_batches)))
         for rank in range(processes)

@@ -1,4 +1,4 @@
-"""Processes that share an evaluation find what one process finds; a validation, too; and an error of one is of all."""
+"""An evaluation or validation shared by processes equals that of one process, and an error is raised in all."""
 
 import json
 from pathlib import Path
@@ -22,7 +22,7 @@ PROBES = [
 
 
 def numbers_of(value: Any, name: str = "") -> dict[str, float]:
-    """Return every number of nested values, by its place."""
+    """Return every number of nested values by its path."""
     if isinstance(value, bool | str) or value is None:
         return {}
     if isinstance(value, int | float):
@@ -39,7 +39,7 @@ def assert_same(one: dict[str, Any], other: dict[str, Any]) -> None:
 
 
 def test_shared_evaluation_equals_single_process_evaluation(make_config, tmp_path: Path, reporter) -> None:
-    """7 clips in batches of 3, of which two are broken: one process has one clip; some actions are the others'."""
+    """7 clips in batches of 3, two of them broken; one process has one clip and needs actions of other processes."""
     changes = {"frames": 6, "test_share": 0.4, "broken_episodes": "skip"}
     data = {f"data__{name}": value for name, value in changes.items()}
     config = make_config(**data, training__steps=2, validation__batch_size=3, validation__every=2)

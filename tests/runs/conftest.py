@@ -1,4 +1,4 @@
-"""A bucket that is there, for the tests of the mirror."""
+"""Fixture: an existing bucket, for the tests of the mirror."""
 
 import pytest
 

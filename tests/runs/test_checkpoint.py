@@ -1,4 +1,4 @@
-"""Checkpoints: complete or not used."""
+"""Checkpoints: complete or ignored; damage, atomic writes, selection, and untrusted files."""
 
 import errno
 import json
@@ -120,7 +120,7 @@ def test_disk_error_is_not_reported_as_damage(tmp_path: Path, monkeypatch: pytes
     assert newest_checkpoint(tmp_path) == newest
 
 
-def test_a_complete_checkpoint_of_another_process_is_never_replaced(tmp_path: Path) -> None:
+def test_complete_checkpoint_of_another_process_is_never_replaced(tmp_path: Path) -> None:
     other = write(tmp_path, 20)
     for step in (20, 10):
         with pytest.raises(InputError, match=r"step-00000020: a complete checkpoint of another process"):
@@ -243,7 +243,7 @@ def test_checkpoint_is_synced_before_an_older_one_is_removed(tmp_path, monkeypat
 
 @contextmanager
 def files_end_at(size: int) -> Iterator[None]:
-    """Let no file grow beyond a size: a full disk for Python, torch and safetensors alike."""
+    """Limit the size of files within the context, which simulates a full disk for Python, torch and safetensors."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -294,7 +294,7 @@ def test_checkpoint_contains_trained_weights_and_not_the_frozen_base(make_config
 
 
 class Bomb:
-    """Leaves a mark when it is unpickled."""
+    """Writes a file when it is unpickled."""
 
     def __init__(self, mark: Path) -> None:
         self._mark = mark
@@ -331,7 +331,7 @@ def test_run_state_round_trip_keeps_every_field(tmp_path: Path) -> None:
 
 
 def test_compressed_or_legacy_optimizer_file_raises(tmp_path: Path) -> None:
-    """A small file of either may take any memory."""
+    """Loading a small file in one of these formats may need any amount of memory."""
     with (tmp_path / "optimizer.pt").open("wb") as file:
         write_torch({"a": torch.zeros(1000)}, file)
     assert read_torch(tmp_path / "optimizer.pt")["a"].shape == (1000,)
@@ -352,7 +352,7 @@ def test_compressed_or_legacy_optimizer_file_raises(tmp_path: Path) -> None:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """A run that was best at step 20, and is at step 30."""
+    """Return a run whose best checkpoint is step 20, and whose newest is step 30."""
     for step, best in [(10, 10), (20, 20), (30, 20)]:
         state = RunState(step, best_step=best, best_error=0.5)
         write_checkpoint(tmp_path / "checkpoints", state, write_weights, keep=9)

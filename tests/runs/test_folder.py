@@ -1,4 +1,4 @@
-"""The folder of a run is checked before it is made, belongs to one run from its first file on; one process trains."""
+"""The run folder: checks before it is created, one run per folder, and a lock for the training process."""
 
 import errno
 import fcntl
@@ -149,7 +149,7 @@ def test_start_overtaken_by_another_one_raises_and_changes_nothing(make_config, 
 
 @pytest.fixture
 def home(tmp_path: Path, data_folder: Path, base_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a data set and a base in it, which is gone to; and one beside it."""
+    """Create a folder with a data set and a base model, and a second folder; the working directory is the first."""
     home = tmp_path / "home"
     home.mkdir()
     (tmp_path / "elsewhere").mkdir()
@@ -209,7 +209,7 @@ LINES = [
 ]
 
 
-def test_every_url_of_a_config_is_listed_with_its_key() -> None:
+def test_remote_locations_of_a_config_are_listed_with_their_keys() -> None:
     assert list_remote_locations(parse_config(ELSEWHERE, where="")) == LINES
     here = {"run_dir": "r", "data": {"path": "d", "exclude": ["gs://is-but-a-name"]}, "model": {"base": "b.pt"}}
     assert list_remote_locations(parse_config(here, where="")) == []
@@ -265,7 +265,7 @@ def test_folder_is_locked_before_remote_access_and_not_by_a_check(
     make_config, reporter, monkeypatch, tmp_path: Path, check_only: bool
 ) -> None:
     config = make_config(checkpoint__remote=str(tmp_path / "remote"))
-    folder, asked = Path(config.run_dir), []
+    folder, targets = Path(config.run_dir), []
     with open_run(make_config(), reporter) as opened:
         opened.begin(opened.config, RunState(step=0))
 
@@ -277,12 +277,12 @@ def test_folder_is_locked_before_remote_access_and_not_by_a_check(
             else:
                 with pytest.raises(InputError, match="in use by"):
                     lock.take()
-        asked.append(options["into"])
+        targets.append(options["into"])
         return config
 
     monkeypatch.setattr(OPEN_REMOTE, remote)
     with open_run(config, reporter, check_only=check_only):
-        (into,) = asked
+        (into,) = targets
         assert (into is not None) == check_only
         assert into is None or folder not in into.parents
     assert into is None or not into.parent.exists()

@@ -37,7 +37,7 @@ def test_incomplete_and_invalid_rows_are_removed(tmp_path: Path) -> None:
 
 
 def test_rows_are_synced_before_the_next_checkpoint(make_config, reporter, monkeypatch) -> None:
-    """Else a power cut could leave a run that goes on behind rows that it does not have."""
+    """Otherwise a run could resume, after a power cut, from a checkpoint whose rows are lost."""
     flushed: list[str] = []
     real = os.fsync
 
@@ -59,7 +59,7 @@ def test_rows_are_synced_before_the_next_checkpoint(make_config, reporter, monke
 
 
 class FullDisk:
-    """Lets writes to metrics.jsonl fail, after some bytes of them, from a row on."""
+    """Makes writes to metrics.jsonl fail after some bytes, from a certain row on."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.is_full, self._write = False, os.write
@@ -113,7 +113,7 @@ def test_run_continues_with_all_metrics_after_a_checkpoint_frees_disk_space(
 
 
 def test_failed_flush_raises_although_the_next_one_succeeds(tmp_path: Path, monkeypatch) -> None:
-    """The system may have forgotten what it was to write."""
+    """After a failed fsync the system may have discarded the data."""
     real, failures = os.fsync, [OSError(errno.EIO, "Input/output error")]
 
     def fsync(handle: int) -> None:

@@ -1,4 +1,4 @@
-"""The mirror follows the run over any network, belongs to this run only, and is given up to a later start."""
+"""The mirror uploads a run despite outages, refuses folders of other runs, and stops after a later start."""
 
 import errno
 import json
@@ -39,13 +39,13 @@ def run(tmp_path: Path) -> Path:
 
 
 def mirror_of(run: Path, place: str = PLACE, run_id: str = "mine", **checkpoint: float) -> Mirror:
-    knobs = {"keep": 3, "remote": place, "remote_every_minutes": 0.0, **checkpoint}
-    values = {"run_dir": str(run), "data": {"path": "d"}, "model": {"base": "b"}, "checkpoint": knobs}
+    settings = {"keep": 3, "remote": place, "remote_every_minutes": 0.0, **checkpoint}
+    values = {"run_dir": str(run), "data": {"path": "d"}, "model": {"base": "b"}, "checkpoint": settings}
     return Mirror(place, parse_config(values, where=""), run_id)
 
 
 def sent(mirror: Mirror) -> None:
-    """Let a pass begin that is due, and wait for its end."""
+    """Start an upload pass if one is due, and wait for it."""
     mirror.upload_if_due()
     if mirror._thread is not None:
         mirror._thread.join()
@@ -145,7 +145,7 @@ def test_incomplete_remote_checkpoints_are_removed_and_later_ones_kept(bucket: G
 
 
 class Gate:
-    """Holds uploads until it is opened, and says when one waits."""
+    """Blocks uploads until it is opened, and sets `waiting` when an upload is blocked."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, match: str = "") -> None:
         self.waiting, self.opened = threading.Event(), threading.Event()
@@ -273,7 +273,7 @@ def test_remote_manifest_with_outside_paths_is_damage(bucket: Gcs, tmp_path: Pat
     assert "which is outside the folder" in problem
 
 
-# A place that fills up or is closed during a run: one warning, and up to date when it works again
+# A remote folder that is full or unreachable during a run causes one warning, and is updated when it works again.
 
 CHECKPOINT = 40_000  # bytes of one, about
 
@@ -317,7 +317,7 @@ def test_upload_to_a_full_disk_is_tried_again(tmp_path: Path, monkeypatch: pytes
 def test_incomplete_checkpoints_on_a_full_disk_are_removed(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, code: int
 ) -> None:
-    place, room = tmp_path / "disk", int(4.2 * CHECKPOINT)  # three that are kept, and one that comes
+    place, room = tmp_path / "disk", int(4.2 * CHECKPOINT)  # three kept checkpoints and a new one
 
     def copy_with_room(source: BinaryIO, target: BinaryIO) -> None:
         used = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
@@ -329,7 +329,7 @@ def test_incomplete_checkpoints_on_a_full_disk_are_removed(
     monkeypatch.setattr(transfer, "shutil", SimpleNamespace(copyfileobj=copy_with_room, rmtree=shutil.rmtree))
     mirror = mirror_of(run, str(place))
     go_on(run, mirror, 10, 20, 30, 40)
-    room -= CHECKPOINT // 2  # others take it
+    room -= CHECKPOINT // 2  # other programs use it
     go_on(run, mirror, 50, 60, 70)
     assert remote_checkpoints(str(place)) == names(20, 30, 40)
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
@@ -346,7 +346,7 @@ def test_incomplete_checkpoints_on_a_full_disk_are_removed(
 
 @dataclass
 class Machine:
-    """Trains, and lets each checkpoint be sent."""
+    """A machine that trains and uploads each checkpoint."""
 
     folder: Path
     place: str
@@ -398,7 +398,7 @@ def test_later_start_keeps_the_remote_folder_and_the_earlier_one_warns_once(
 def test_only_one_of_two_simultaneous_starts_keeps_the_remote_folder(
     machine, disk: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each saw an empty place; the runs have different names."""
+    """Both starts saw an empty remote folder; the runs have different ids."""
     first, second = machine("one", "this"), machine("two", "that")
     with monkeypatch.context() as at_once:
         at_once.setattr(RemoteCheckpoints, "list_files", lambda _: {})

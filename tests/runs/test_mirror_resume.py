@@ -35,8 +35,8 @@ def config(make_config: Callable[..., Config]) -> Config:
 
 
 def run_there(gcs: Gcs, config: Config, *steps: int, run_id: str = "mine", **state: object) -> Path:
-    """Put a run with these checkpoints at the place; return the folder it was put from."""
-    folder = Path(config.run_dir).parent / f"elsewhere-{run_id}"
+    """Upload a run with these checkpoints; return its local folder."""
+    folder = Path(config.run_dir).parent / f"uploaded-{run_id}"
     for step in steps:
         write(folder, step, RunState(step, run_id, **state), keep=9)
     (folder / "config.yaml").write_text(config_as_yaml(config))
@@ -90,7 +90,7 @@ def test_damaged_remote_checkpoint_is_skipped_with_a_warning(
         bucket.put(f"bucket/{victim}", bytes(data) if damage == "flip" else b"{")
     open_remote(config, SILENT)
     assert [path.name for path in (local(config) / "checkpoints").iterdir()] == [checkpoint_name(10)]
-    assert remote_checkpoints(PLACE) == [checkpoint_name(10)], "nobody is to try the other one again"
+    assert remote_checkpoints(PLACE) == [checkpoint_name(10)], "the damaged checkpoint is removed"
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert f"{PLACE}: {checkpoint_name(20)}" in caplog.text
 
@@ -115,16 +115,16 @@ def test_unreadable_remote_checkpoint_raises_and_is_kept(
     assert [path.name for path in (local(config) / "checkpoints").glob("step-*")] == [checkpoint_name(10)] * bool(here)
 
 
-@pytest.mark.parametrize(("here", "elsewhere", "taken"), [(10, 20, 20), (20, 10, 20), (20, 20, 20)])
+@pytest.mark.parametrize(("here", "remote_step", "expected"), [(10, 20, 20), (20, 10, 20), (20, 20, 20)])
 def test_run_resumes_from_the_later_of_local_and_remote_checkpoint(
-    bucket: Gcs, config: Config, here: int, elsewhere: int, taken: int
+    bucket: Gcs, config: Config, here: int, remote_step: int, expected: int
 ) -> None:
-    run_there(bucket, config, elsewhere)
+    run_there(bucket, config, remote_step)
     write(local(config), here)
     (local(config) / "config.yaml").write_text(config_as_yaml(config))
     open_remote(config, SILENT)
-    assert newest_checkpoint(local(config) / "checkpoints").name == checkpoint_name(taken)
-    assert bool(bucket.bytes_read("optimizer.pt")) == (elsewhere > here)
+    assert newest_checkpoint(local(config) / "checkpoints").name == checkpoint_name(expected)
+    assert bool(bucket.bytes_read("optimizer.pt")) == (remote_step > here)
 
 
 def test_remote_run_with_another_config_raises(bucket: Gcs, config: Config) -> None:
@@ -211,7 +211,7 @@ def test_mirror_inside_the_run_folder_raises(make_config: Callable[..., Config],
 
 
 def test_run_folder_is_locked_before_a_download(bucket: Gcs, config: Config) -> None:
-    """Two that start at once in a new folder: the second would put older metrics over those of the first."""
+    """With two simultaneous starts, the second one would overwrite newer metrics of the first."""
     run_there(bucket, config, 10)
     with RunLock(local(config)) as first, RunLock(local(config)) as second:
         first.take()
@@ -243,12 +243,12 @@ def test_interrupted_download_starts_again(bucket: Gcs, config: Config, monkeypa
     assert content(local(config)) == content(source)
 
 
-# A run that goes on elsewhere
+# A run that resumes on another machine
 
 
 @pytest.fixture
 def config_on(make_config: MakeConfig, tmp_path: Path) -> MakeConfig:
-    """Return the config of a machine; what it writes is sent at once."""
+    """Return a function that makes the config of a machine, which uploads each checkpoint immediately."""
 
     def config(machine: str, place: str = PLACE, **changes: object) -> Config:
         usual = {"checkpoint__remote_every_minutes": 0.0, "checkpoint__keep_best": "off"}
@@ -332,7 +332,7 @@ def place(tmp_path: Path) -> str:
 
 
 def die_in_upload(config: object, reporter, monkeypatch: pytest.MonkeyPatch, *, before_file: int) -> None:
-    """Train until so many files of checkpoints are at the place; then nothing happens any more."""
+    """Train, and simulate a kill before the upload of checkpoint file number `before_file`."""
     sent, real = list[str](), storage.upload
 
     def upload(source: Path, target: str) -> None:
@@ -388,7 +388,7 @@ def test_incomplete_remote_checkpoint_of_another_run_raises_before_the_first_ste
 
 
 def test_remote_small_files_without_a_checkpoint_do_not_block_a_new_run(config_on, reporter, place: str) -> None:
-    """Who removes the checkpoints of a place starts a run anew there, with another config if need be."""
+    """After removing the remote checkpoints, a user can start a new run there, also with another config."""
     train(config_on("this", place), reporter)
     for name in remote_checkpoints(place):
         RemoteCheckpoints(place).remove(name)

@@ -1,4 +1,4 @@
-"""The base of a run: recognised where it was moved to, and named where nothing was trained on it."""
+"""The base model of a run: found at a new path, and named for checkpoints of step 0."""
 
 import shutil
 from collections.abc import Callable
@@ -32,7 +32,7 @@ from vjepa2_ac.training import setup
 
 @pytest.fixture
 def run(make_config, base_folder: Path, tmp_path: Path) -> str:
-    """Return a run whose base is gone from its path."""
+    """Return a run whose base model was moved."""
     folder = write_adapted_run(make_config(base_folder=shutil.copytree(base_folder, tmp_path / "gone")))
     shutil.rmtree(tmp_path / "gone")
     return str(folder)
@@ -40,7 +40,7 @@ def run(make_config, base_folder: Path, tmp_path: Path) -> str:
 
 @pytest.fixture(scope="module")
 def another(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Return a base of the same sizes with other weights."""
+    """Return a base model of the same sizes with other weights."""
     folder = tmp_path_factory.mktemp("another") / "base"
     WorldModel.random(ModelSizes.model_validate(TINY), seed=4).save_pretrained(folder)
     return str(folder)
@@ -58,9 +58,9 @@ def exported(run: str, overrides: list[str]) -> WorldModel:
 
 
 def evaluated(run: str, overrides: list[str]) -> WorldModel:
-    asked = EvaluationOptions(overrides=tuple(overrides))
-    config = resolve_config(run, asked)
-    return load_models(run, config, asked, open_dataset(config.data)).world_model
+    options = EvaluationOptions(overrides=tuple(overrides))
+    config = resolve_config(run, options)
+    return load_models(run, config, options, open_dataset(config.data)).world_model
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def evaluated(run: str, overrides: list[str]) -> WorldModel:
     ],
     ids=["load_run", "plan", "export", "evaluate"],
 )
-def test_a_run_is_used_with_its_moved_base_and_with_no_other(
+def test_run_accepts_its_moved_base_model_and_no_other(
     run: str, base_folder: Path, another: str, load: Callable[[str, list[str]], WorldModel]
 ) -> None:
     with pytest.raises(InputError, match=rf"gone: no such .* run `vjepa2-ac train {run} --resume model\.base=PATH`"):
@@ -85,13 +85,13 @@ def test_a_run_is_used_with_its_moved_base_and_with_no_other(
     assert not torch.allclose(found, base, atol=1e-4), "the adapter is on it"
 
 
-def test_nothing_else_is_changed_on_the_way(run: str, base_folder: Path) -> None:
+def test_other_overrides_raise_when_a_run_is_loaded(run: str, base_folder: Path) -> None:
     with pytest.raises(InputError, match=r"adapter\.rank=8: a key that cannot be changed when a run is loaded"):
         load_run(run, overrides=["adapter.rank=8"])
     with pytest.raises(InputError, match="not the folder of a run"):
         load_for_planning(str(base_folder), overrides=["model.base=elsewhere"])
-    asked = EvaluationOptions(overrides=(f"model.base={base_folder}", "planning.samples=30"))
-    config = resolve_config(run, asked)
+    options = EvaluationOptions(overrides=(f"model.base={base_folder}", "planning.samples=30"))
+    config = resolve_config(run, options)
     assert (config.model.base, config.planning.samples) == (str(base_folder), 30)
     with pytest.raises(InputError, match=r"override: model\.dtype"):
         resolve_config(run, EvaluationOptions(overrides=("model.dtype=bfloat16",)))
@@ -109,7 +109,7 @@ STATE = "0.4,0,0.3,3.1,0,0.1,0.2"
         "train RUN --resume",
     ],
 )
-def test_the_error_shows_the_command_with_the_new_path(
+def test_missing_base_model_raises_with_the_command_for_a_new_path(
     run: str, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     words = command.replace("RUN", run).replace("STATE", STATE)
@@ -117,7 +117,7 @@ def test_the_error_shows_the_command_with_the_new_path(
     assert f"run `vjepa2-ac {words} model.base=PATH`" in capsys.readouterr().err
 
 
-def test_a_run_resumes_on_its_moved_base_and_keeps_the_path(
+def test_resume_with_a_moved_base_model_stores_the_new_path(
     whole_run: Path, base_folder: Path, another: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
     run, moved = shutil.copytree(whole_run, tmp_path / "run"), shutil.copytree(base_folder, tmp_path / "moved")
@@ -175,7 +175,7 @@ def base_run(make_config: MakeConfig) -> Path:
         ),
     ],
 )  # fmt: skip
-def test_a_checkpoint_before_the_first_step_is_called_what_it_is(
+def test_checkpoint_of_step_0_is_described_as_untrained(
     make_config: MakeConfig, changes: dict[str, Any], how: dict[str, Any], checkpoint: str, note: str
 ) -> None:
     found = load_subject(untrained_run(make_config(**changes), **how), checkpoint)
@@ -183,7 +183,7 @@ def test_a_checkpoint_before_the_first_step_is_called_what_it_is(
     assert found.is_base == ("base model:" in note or "base model." in note)
 
 
-def test_the_base_is_measured_once_and_its_metrics_say_so(base_run: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_checkpoint_of_step_0_is_evaluated_once_as_base_model(base_run: Path, caplog: pytest.LogCaptureFixture) -> None:
     measured = write_evaluation(evaluate_subject(str(base_run), FEW), base_run)
     assert caplog.messages == [SELECTED]
     assert [(one.name, one.role) for one in measured.evaluation.models.values()] == [("base", "trained")]
@@ -195,13 +195,13 @@ def test_the_base_is_measured_once_and_its_metrics_say_so(base_run: Path, caplog
     export_run(base_run, base_run / "hub", "hub")
     assert f"**{SELECTED}**" in (base_run / "hub" / CARD).read_text()
     assert "| base |" in (base_run / "hub" / CARD).read_text()
-    asked = EvaluationOptions(clips=3, probes=FEW.probes, checkpoint="newest", out=base_run / "newest")
-    later = write_evaluation(evaluate_subject(str(base_run), asked), base_run / "newest").evaluation
+    options = EvaluationOptions(clips=3, probes=FEW.probes, checkpoint="newest", out=base_run / "newest")
+    later = write_evaluation(evaluate_subject(str(base_run), options), base_run / "newest").evaluation
     assert (list(later.models), later.about.is_base) == (["base", "adapter"], False)
     assert list(compare([base_run, base_run / "newest"]).measured) == ["run", "newest"]
 
 
-def test_an_export_says_so_before_it_writes(
+def test_export_of_a_checkpoint_of_step_0_warns(
     base_run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("vjepa2_ac.export.merge_adapter", lambda _: 1 / 0)

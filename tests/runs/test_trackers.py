@@ -1,4 +1,4 @@
-"""Trackers: they get the metrics, and resume the same run; a failing one causes a warning only."""
+"""Trackers receive the metrics and resume the same run; a failing tracker only causes a warning."""
 
 import importlib.util
 import logging
@@ -34,8 +34,8 @@ def run_config(folder: Path, **tracking: Any) -> Config:
     return parse_config(values, where="test")
 
 
-class Kept:
-    """A tracker that keeps what it gets, or raises."""
+class RecordingTracker:
+    """A tracker that records its input, or raises."""
 
     def __init__(self, fails_in: str = "") -> None:
         self.rows: list[tuple[int, dict[str, float]]] = []
@@ -62,11 +62,11 @@ class Kept:
             raise ConnectionError("the network is away")
 
 
-def failing() -> Kept:
+def failing() -> RecordingTracker:
     raise ConnectionError("the network is away")
 
 
-def leaving() -> Kept:
+def leaving() -> RecordingTracker:
     raise SystemExit(3)
 
 
@@ -75,26 +75,28 @@ def warnings_in(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 def test_trackers_receive_metrics_by_name_and_lists_as_numbers() -> None:
-    kept = Kept()
-    trackers = Trackers({"one": lambda: kept})
+    recorder = RecordingTracker()
+    trackers = Trackers({"one": lambda: recorder})
     trackers.log("validation", 7, {"error": 0.5, "by_horizon": [1.0, 2.0], "nothing": float("nan"), "words": "no"})
     trackers.close()
-    assert kept.rows == [(7, {"validation/error": 0.5, "validation/by_horizon/1": 1.0, "validation/by_horizon/2": 2.0})]
+    assert recorder.rows == [
+        (7, {"validation/error": 0.5, "validation/by_horizon/1": 1.0, "validation/by_horizon/2": 2.0})
+    ]
 
 
 @pytest.mark.parametrize("opening", [failing, leaving])
-def test_tracker_that_cannot_be_opened_causes_one_warning(caplog, opening: Callable[[], Kept]) -> None:
-    kept = Kept()
-    trackers = Trackers({"bad": opening, "good": lambda: kept})
+def test_tracker_that_cannot_be_opened_causes_one_warning(caplog, opening: Callable[[], RecordingTracker]) -> None:
+    recorder = RecordingTracker()
+    trackers = Trackers({"bad": opening, "good": lambda: recorder})
     trackers.log("train", 1, {"loss": 0.5})
     trackers.close()
-    assert len(kept.rows) == kept.closed == 1
+    assert len(recorder.rows) == recorder.closed == 1
     assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["bad cannot be opened"]
 
 
 @pytest.mark.parametrize("fails_in", ["log", "finish"])
 def test_tracker_that_fails_later_causes_one_warning(caplog, fails_in: str) -> None:
-    bad, good = Kept(fails_in), Kept()
+    bad, good = RecordingTracker(fails_in), RecordingTracker()
     trackers = Trackers({"bad": lambda: bad, "good": lambda: good})
     for step in (1, 2):
         trackers.log("train", step, {"loss": 0.5})
@@ -126,7 +128,7 @@ def test_tensorboard_receives_metrics_and_drops_repeated_steps(tmp_path: Path) -
     ]  # fmt: skip
 
 
-def test_a_run_without_tensorboard_prints_how_to_install_it(
+def test_run_without_tensorboard_prints_how_to_install_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     find = importlib.util.find_spec

@@ -1,4 +1,4 @@
-"""A finished run is left as it is: nothing is loaded, and only settings that decide nothing are written."""
+"""Training a finished run loads nothing and writes only settings that do not affect results."""
 
 import shutil
 from pathlib import Path
@@ -14,7 +14,7 @@ from vjepa2_ac.training.loop import train
 
 
 class LoadedError(Exception):
-    """Stands for everything that takes long."""
+    """Raised instead of loading data or a model."""
 
 
 @pytest.fixture

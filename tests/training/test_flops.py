@@ -30,7 +30,7 @@ ADAPTERS: dict[str, dict[str, Any]] = {
 
 
 def counted(config: Config, clips: int = 2) -> tuple[int, int]:
-    """Return what PyTorch counts of the objective of one clip, forward and backward."""
+    """Return PyTorch's FLOP counts for one clip: forward and backward pass."""
     model = built(config, SIZES)
     frames, objective = config.data.frames, Objective(model, config.training)
     batch = LatentBatch(

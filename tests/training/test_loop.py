@@ -55,7 +55,7 @@ def test_resumed_run_equals_an_uninterrupted_run_for_each_training_mode(
     assert_same_run(tmp_path / "whole", tmp_path / "broken")
 
 
-def test_the_number_of_loader_workers_changes_nothing(make_config, reporter, tmp_path) -> None:
+def test_number_of_loader_workers_does_not_change_a_run(make_config, reporter, tmp_path) -> None:
     train(make_config(run_dir=str(tmp_path / "none"), training__steps=2), reporter)
     train(make_config(run_dir=str(tmp_path / "two"), training__steps=2, data__workers=2), reporter)
     assert_same_run(tmp_path / "none", tmp_path / "two")
@@ -145,7 +145,7 @@ def test_an_allowed_config_change_is_written_and_reported(make_config, reporter)
 
 
 def test_allowed_changes_of_the_optimizer_take_effect(make_config, reporter) -> None:
-    """Its saved state has the old settings, and would restore them."""
+    """The saved state of the optimizer contains the old settings."""
     train(make_config(training__steps=2, training__weight_decay=0.04), reporter)
     run = set_up(make_config(training__weight_decay=0.5), reporter)
     assert [group["weight_decay"] for group in run.optimizer.param_groups] == [0.5]
@@ -186,7 +186,7 @@ def test_resumed_run_remembers_broken_episodes(make_config, reporter, monkeypatc
     assert set_up(config, reporter).dataset.broken.reasons == {bad: "here: damaged."}
 
 
-def test_checkpoint_is_saved_after_fifteen_minutes(make_config, reporter, tmp_path, monkeypatch) -> None:
+def test_checkpoint_is_saved_at_the_time_limit(make_config, reporter, tmp_path, monkeypatch) -> None:
     for seconds, written in ((0.0, [1, 2, 3]), (3600.0, [3])):
         monkeypatch.setattr(outputs, "SAVE_EVERY_S", seconds)
         keys = {"run_dir": tmp_path / str(seconds), "checkpoint__every": 100, "checkpoint__keep_best": "off"}

@@ -99,7 +99,7 @@ def clips(*, extrinsics: bool = False) -> LatentBatch:
 
 
 def plain_losses(model: WorldModel, batch: LatentBatch, steps: int) -> tuple[Tensor, Tensor]:
-    """Compute the rollout from the first frame on, and everything again for each prediction."""
+    """Compute the losses without cached keys and values: each prediction is computed from the first frame on."""
 
     def predict(latents: Tensor, time: int) -> Tensor:
         cameras = None if batch.extrinsics is None else batch.extrinsics[:, :time]

@@ -1,4 +1,4 @@
-"""The memory estimate adds up what is allocated at once, depends on every relevant knob, and doctor prints it."""
+"""The memory estimate: parts, totals, suggested savings, parameter counts, and the output of `doctor`."""
 
 import json
 from typing import Any
@@ -16,20 +16,20 @@ from vjepa2_ac.training.optim import make_optimizer
 
 
 def bytes_of_moments(**changes: object) -> tuple[int, int]:
-    """Return the bytes of the estimate and those of an optimizer that has made a step."""
+    """Return the bytes of the estimate and those of an optimizer after one step."""
     config, sizes = run_config({**LORA, "rank": 24, "dora": True}, **changes), model_sizes(width=96)
     model = built(config, sizes)
     for value in model.parameters():
         value.grad = torch.ones_like(value) if value.requires_grad else None
     optimizer = make_optimizer(model, config.training)
     optimizer.step()
-    kept = {
+    tensors = {
         tensor.data_ptr(): tensor.nbytes
         for state in optimizer.state.values()
         for name, tensor in state.items()
         if isinstance(tensor, torch.Tensor) and name != "step" and not name.startswith("qmap")  # one table for all
     }
-    return estimate_memory(config, sizes).parts["optimizer state"], sum(kept.values())
+    return estimate_memory(config, sizes).parts["optimizer state"], sum(tensors.values())
 
 
 def test_estimated_moments_equal_those_of_the_optimizer() -> None:
@@ -47,13 +47,15 @@ USUAL = {"run_dir": "run", "data": {"path": "set", "frames": 16}, "model": {"bas
 
 
 def usual(**training: object) -> Config:
-    """Return a run that is measured once for all tests."""
+    """Return a config whose step is measured once for all tests."""
     return parse_config({**USUAL, "training": training}, where="test")
 
 
 def test_memory_savings_are_suggested_only_for_a_run_that_does_not_fit() -> None:
     config, sizes = usual(batch_size=8), model_sizes()
-    stored, checkpointed = (estimate_memory(config, sizes).total(checkpointing=one) for one in (False, True))
+    stored, checkpointed = (
+        estimate_memory(config, sizes).total(checkpointing=checkpointing) for checkpointing in (False, True)
+    )
     assert checkpointed < stored
     assert suggest_memory_savings(config, sizes, stored) == []
     assert suggest_memory_savings(config, sizes, stored - 1) == ["training.gradient_checkpointing=true"]
@@ -82,7 +84,7 @@ def test_batch_is_not_counted_while_the_predictor_runs(encoder: int, peak: int) 
     assert MemoryEstimate(parameters, checkpointing=False, parts=parts).total(checkpointing=False) == peak
 
 
-# Parameter counts are exact: tensor by tensor those of a built model
+# Parameter counts equal those of a built model, tensor by tensor.
 
 HEADS = ["action_encoder", "state_encoder"]
 ADAPTERS: dict[str, dict[str, Any]] = {

@@ -1,4 +1,4 @@
-"""A captured and replayed micro-step equals the plain one, whatever becomes of the gradients between steps."""
+"""A captured and replayed micro-step equals the plain one."""
 
 import itertools
 from collections.abc import Callable, Iterator
@@ -27,24 +27,24 @@ class Recorder:
         self.run, self.captures, self.replays = run, 0, 0
 
     def __call__(self, body: Body) -> Body:
-        for _ in range(2):  # to warm up, which adds gradients
+        for _ in range(2):  # warm-up runs, which add gradients
             body()
         self.captures += 1
-        places = self.places()
+        addresses = self.gradient_addresses()
 
         def replay() -> None:
-            assert self.places() == places
+            assert self.gradient_addresses() == addresses
             self.replays += 1
             body()
 
         return replay
 
-    def places(self) -> list[int | None]:
-        return [None if one.grad is None else one.grad.data_ptr() for one in self.run.trained]
+    def gradient_addresses(self) -> list[int | None]:
+        return [None if weight.grad is None else weight.grad.data_ptr() for weight in self.run.trained]
 
 
 def uneven(batches: Iterator[Batch]) -> Iterator[Batch]:
-    """Leave out clips, as where some cannot be read: of the third micro-batch one, of the fifth all."""
+    """Remove unreadable clips: all but one of the third micro-batch, all of the fifth."""
     for number, batch in enumerate(batches):
         yield some_clips(batch, list(range({2: 1, 4: 0}.get(number, len(batch.starts)))))
 
@@ -68,7 +68,7 @@ def make_run(make_config: Callable[..., Config], reporter) -> Callable[..., Run]
 
 
 def recorded(run: Run) -> Recorder:
-    """Let a run capture its micro-step, on whatever device."""
+    """Make a run capture its micro-step with a `Recorder`, on any device."""
     recorder = Recorder(run)
     run.micro_step = GraphedMicroStep(recorder)
     return recorder

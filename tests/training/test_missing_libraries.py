@@ -11,7 +11,7 @@ from vjepa2_ac.training.loop import train
 
 
 @pytest.mark.parametrize(
-    ("library", "knob", "value", "extra"),
+    ("library", "key", "value", "extra"),
     [
         ("bitsandbytes", "training__optimizer", "adamw_8bit", "8bit"),
         ("wandb", "tracking__wandb", "offline", "wandb"),
@@ -19,11 +19,11 @@ from vjepa2_ac.training.loop import train
     ],
 )
 def test_missing_libraries_are_reported_before_mirror_or_data_are_opened(
-    make_config, reporter, monkeypatch, library: str, knob: str, value: object, extra: str
+    make_config, reporter, monkeypatch, library: str, key: str, value: object, extra: str
 ) -> None:
     for name in (library, f"{library}.optim"):
         monkeypatch.setitem(sys.modules, name, None)
-    config = make_config(data__path="nowhere", checkpoint__remote="nothing://reads/this", **{knob: value})
+    config = make_config(data__path="nowhere", checkpoint__remote="nothing://reads/this", **{key: value})
     with pytest.raises(UserError, match=rf"{library}.* is not installed.*{re.escape(pip_install(extra))}"):
         train(config, reporter)
 

@@ -1,4 +1,4 @@
-"""While a run trains: a diverging one warns once per cause, and throughput metrics equal their definitions."""
+"""Monitoring: a diverging run causes one warning per cause, and throughput metrics equal their definitions."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""A robot with other states or actions than the base's: from its recordings to a trained model."""
+"""A robot whose states or actions differ from the base model's: from recordings to a trained model."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,7 +30,7 @@ ROBOTS = {"14/14": Widths(14, 14), "8/7": Widths(8, 7), "7/8": Widths(7, 8)}
 
 @pytest.fixture
 def make_robot(make_config: MakeConfig, tmp_path: Path) -> MakeConfig:
-    """Return the config of a tiny run on a robot of some widths; the base must prove itself."""
+    """Return the config of a tiny run on a robot with some widths; the check of the base model is on."""
 
     def make(widths: Widths = ROBOTS["14/14"], **changes: object) -> Config:
         folder = tmp_path / f"set {widths.state} {widths.action}"

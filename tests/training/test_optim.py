@@ -52,16 +52,16 @@ def test_weight_decay_excludes_biases_norms_and_frozen_weights() -> None:
 
 @pytest.fixture
 def fuse(monkeypatch: pytest.MonkeyPatch) -> Callable[[bool], None]:
-    """Decides whether AdamW is fused; a CPU can do that, too."""
+    """Return a function that sets whether AdamW is fused, which also works on a CPU."""
     return lambda fused: monkeypatch.setattr(optim, "_are_on_cuda", lambda _: fused)
 
 
 def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
-    """Return the state of an optimizer as a checkpoint holds it."""
-    kept = io.BytesIO()
-    torch.save(optimizer.state_dict(), kept)
-    kept.seek(0)
-    return dict(torch.load(kept, weights_only=True, map_location="cpu"))
+    """Return the state of an optimizer as in a checkpoint."""
+    buffer = io.BytesIO()
+    torch.save(optimizer.state_dict(), buffer)
+    buffer.seek(0)
+    return dict(torch.load(buffer, weights_only=True, map_location="cpu"))
 
 
 @pytest.mark.parametrize("kinds", [(False, True)])

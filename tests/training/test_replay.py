@@ -25,7 +25,7 @@ Names = list[tuple[str, int]]
 
 @pytest.fixture(scope="module")
 def second(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The second data set, of other episodes than the first."""
+    """Write the replay data set, whose episodes differ from those of the first data set."""
     folder = tmp_path_factory.mktemp("second") / "set"
     return write_synthetic_droid(folder, episodes=4, steps=20, size=(36, 64), first=100)
 
@@ -37,8 +37,8 @@ def replaying(make_config, second: Path):
     def make(share: float = 0.25, **changes: object) -> Config:
         values = config_as_dict(make_config())
         data = {**values["data"], "path": str(second), "validation_share": 0.0, "test_share": 0.0}
-        given = {f"replay__data__{key}": value for key, value in data.items()}
-        return make_config(**{**given, "replay__share": share, **changes})
+        replay_keys = {f"replay__data__{key}": value for key, value in data.items()}
+        return make_config(**{**replay_keys, "replay__share": share, **changes})
 
     return make
 
@@ -47,9 +47,9 @@ def names(batches: list[Batch]) -> Names:
     return [name for batch in batches for name in zip(batch.episode_ids, batch.starts, strict=True)]
 
 
-def clips_of(config: Config, count: int, **knobs: object) -> Names:
+def clips_of(config: Config, count: int, **options: object) -> Names:
     first, replayed = (open_dataset(one) for one in config.data_sets)
-    chosen = {"seed": 1, "batch_size": 4, **knobs}
+    chosen = {"seed": 1, "batch_size": 4, **options}
     batches = training_loader(MixedDataset(first, replayed, config.replay.share), **chosen)
     return names(list(itertools.islice(batches, count)))
 

@@ -1,4 +1,4 @@
-"""Errors of other clips, another time span or other latents are not compared."""
+"""The best checkpoint is kept only if its validation is comparable: same clips, time span and latents."""
 
 from dataclasses import replace
 

@@ -26,14 +26,14 @@ CHANGES = {
 
 
 class Killer:
-    """Starts a run, kills it in one of three ways in turn, and counts."""
+    """Starts and kills runs in three modes, one after the other, and counts the kills."""
 
     def __init__(self, nursery: Nursery, seed: int) -> None:
         self.kills, self.in_a_checkpoint, self.processes = 0, 0, set()
         self._nursery, self._chance = nursery, np.random.default_rng(seed)
 
     def kill(self, config_file: Path, run: Path) -> int:
-        """Start or resume a run, and kill it; return its status, which differs if it was done before."""
+        """Start or resume a run and kill it; return its exit status, which is 0 if it finished first."""
         before = half_written(run)
         child, wait = self._start(WAYS[self.kills % len(WAYS)], config_file, run)
         self.processes.add(child.pid)
@@ -43,25 +43,25 @@ class Killer:
             self.in_a_checkpoint += bool(half_written(run) - before)
         return status
 
-    def _start(self, way: str, config_file: Path, run: Path):
+    def _start(self, mode: str, config_file: Path, run: Path):
         chance, arguments = self._chance, ("train", str(config_file))
-        if way == "before a file":  # one of some 25 for each checkpoint; those at the start are before the first
+        if mode == "before a file":  # one of some 25 for each checkpoint; those at the start are before the first
             child = self._nursery.start(*arguments, folder=run, die_at=int(chance.integers(1, 120)))
             return child, child.wait
         child = self._nursery.start(*arguments, folder=run)
-        if way == "while writing":
+        if mode == "while writing":
             wait_for_writing(child, run / "checkpoints", times=int(chance.integers(1, 4)))
-            return child, lambda: child.kill_after(chance.uniform(0.0, 0.01))  # writing takes about so long
+            return child, lambda: child.kill_after(chance.uniform(0.0, 0.01))  # about the duration of a write
         return child, lambda: child.kill_after(chance.uniform(0.0, 2.0))
 
 
 def half_written(run: Path) -> set[tuple[str, int]]:
-    """Return the checkpoints that were not finished, each with the time of its last change."""
+    """Return the incomplete checkpoints, each with the time of its last change."""
     return {(path.name, path.stat().st_ctime_ns) for path in (run / "checkpoints").glob(".writing-*")}
 
 
 def wait_for_writing(child: Child, checkpoints: Path, times: int) -> None:
-    """Wait until a run has begun to write that many checkpoints, or is done."""
+    """Wait until a run has begun to write `times` checkpoints, or has ended."""
     seen: set[str] = set()
     while len(seen) < times and child.is_running():
         seen |= {path.name for path in checkpoints.glob(".writing-*")}
@@ -75,13 +75,13 @@ def test_run_killed_many_times_equals_an_uninterrupted_run(
 ) -> None:
     changes = {**CHANGES, "checkpoint__keep_best": keep_best}
     train(make_config(run_dir=str(tmp_path / "whole"), **changes), reporter)
-    killer, runs, wanted = Killer(nursery, seed=2 * workers + (keep_best == "error")), 0, MANY or len(WAYS)
-    while killer.kills < wanted:
+    killer, runs, num_kills = Killer(nursery, seed=2 * workers + (keep_best == "error")), 0, MANY or len(WAYS)
+    while killer.kills < num_kills:
         runs += 1
         run, config_file = tmp_path / f"killed-{runs}", tmp_path / f"{runs}.yaml"
         config_file.write_text(config_as_yaml(make_config(run_dir=str(run), data__workers=workers, **changes)))
         status = KILLED
-        while status == KILLED and killer.kills < wanted:
+        while status == KILLED and killer.kills < num_kills:
             status = killer.kill(config_file, run)
         if status == KILLED:
             status = nursery.start("train", str(config_file), folder=run).wait()

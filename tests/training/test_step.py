@@ -31,7 +31,7 @@ def prepared(make_config: Any, reporter: Any, batch_size: int, accumulation: int
     return set_up(config, reporter)
 
 
-def taken(run: Run, batches: list[Batch]) -> tuple[Gradients, dict[str, torch.Tensor]]:
+def step_gradients(run: Run, batches: list[Batch]) -> tuple[Gradients, dict[str, torch.Tensor]]:
     run.optimizer.zero_grad(set_to_none=True)
     metrics = gradients(run, iter(batches))
     return metrics, {n: p.grad.clone() for n, p in run.world_model.named_parameters() if p.grad is not None}
@@ -41,10 +41,10 @@ def taken(run: Run, batches: list[Batch]) -> tuple[Gradients, dict[str, torch.Te
 def test_skipped_clips_give_the_mean_over_the_remaining_clips(make_config, reporter, read: list[list[int]]) -> None:
     run = prepared(make_config, reporter, 4, 2)
     whole = next(training_loader(run.dataset, seed=0, batch_size=4))
-    metrics, gradient = taken(run, [some_clips(whole, chosen) for chosen in read])
+    metrics, gradient = step_gradients(run, [some_clips(whole, chosen) for chosen in read])
     clips = [clip for chosen in read for clip in chosen]
     alone = prepared(make_config, reporter, len(clips), 1)
-    expected, expected_gradient = taken(alone, [some_clips(whole, clips)])
+    expected, expected_gradient = step_gradients(alone, [some_clips(whole, clips)])
     assert metrics.clips == len(clips)
     assert metrics.forced_loss == pytest.approx(expected.forced_loss, rel=1e-5)
     assert metrics.rollout_loss == pytest.approx(expected.rollout_loss, rel=1e-5)
@@ -78,7 +78,7 @@ def test_camera_poses_are_passed_only_to_a_model_that_needs_them(make_config, re
 
 
 def with_loss_scale(run: Run, scale: float) -> Run:
-    """Let a run scale its losses, as it does in fp16; a CPU can do that in fp32, too."""
+    """Enable loss scaling as in fp16; it also works in fp32 on a CPU."""
     run.scaler = torch.amp.GradScaler("cpu", init_scale=scale, growth_interval=2)
     return run
 
@@ -132,7 +132,7 @@ def test_the_loss_scale_is_restored(make_config, reporter, tmp_path) -> None:
 
 @pytest.fixture
 def bad_clip(make_config: Any, reporter: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[str, int]:
-    """The second clip of a run is poisoned where it is read: a state is not a number."""
+    """Replace a state of the second clip of a run by NaN when it is read."""
     read, batch = loader.read_clip, next(batches_from(set_up(make_config(), reporter)))
     bad = (batch.episode_ids[1], batch.starts[1])
 

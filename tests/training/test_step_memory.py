@@ -1,4 +1,4 @@
-"""A step on fake tensors takes the memory that a real one takes, whatever is trained, and all of its blocks at once."""
+"""The memory of a step on fake tensors equals that of a real step, for each kind of training."""
 
 import contextlib
 from typing import Any
@@ -49,18 +49,18 @@ CASES = {  # adapter, other keys, sizes
 
 
 class Counting(TorchDispatchMode):
-    """Counts the bytes of real tensors that live at once."""
+    """Counts the bytes of real tensors that are allocated at the same time."""
 
     def __init__(self) -> None:
         super().__init__()
         self.storages = LiveStorages()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        made = func(*args, **(kwargs or {}))
-        for leaf in tree_leaves(made):
+        outputs = func(*args, **(kwargs or {}))
+        for leaf in tree_leaves(outputs):
             if isinstance(leaf, Tensor):
                 self.storages.count(leaf)
-        return made
+        return outputs
 
 
 def clips(config: Config, model: WorldModel) -> LatentBatch:
@@ -71,8 +71,8 @@ def clips(config: Config, model: WorldModel) -> LatentBatch:
     return LatentBatch(latents, poses, poses[:, 1:].clone(), cameras, ("a",) * batch, (0,) * batch)
 
 
-def taken_by_pytorch(config: Config, sizes: ModelSizes) -> tuple[int, ...]:
-    """Return the bytes that live at once in a forward and backward pass, without checkpointing and with it."""
+def measured_peaks(config: Config, sizes: ModelSizes) -> tuple[int, ...]:
+    """Return the peak bytes of a forward and backward pass, without and with checkpointing."""
     rotary_tables.cache_clear()
     dtype, peaks = PRECISIONS[config.training.precision], []
     arithmetic = contextlib.nullcontext() if dtype == torch.float32 else torch.autocast("cpu", dtype)
@@ -98,7 +98,7 @@ def test_estimated_step_memory_equals_the_peak_on_a_cpu(name: str) -> None:
     adapter, changes, sizes = CASES[name]
     config = run_config(adapter, **changes)
     step = measure_step(config, sizes, "cpu")
-    assert (step.stored, step.checkpointed) == pytest.approx(taken_by_pytorch(config, sizes), rel=TOLERANCE)
+    assert (step.stored, step.checkpointed) == pytest.approx(measured_peaks(config, sizes), rel=TOLERANCE)
 
 
 def test_memory_of_all_blocks_follows_from_two_and_three(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,7 +108,7 @@ def test_memory_of_all_blocks_follows_from_two_and_three(monkeypatch: pytest.Mon
     cost_step._measured.clear()
     whole = measure_step(config, sizes)
     cost_step._measured.clear()
-    assert inferred == pytest.approx(whole, rel=0.005)  # the place of the peak may change with depth
+    assert inferred == pytest.approx(whole, rel=0.005)  # the step of the peak may change with depth
 
 
 @pytest.mark.parametrize(("changes", "copies"), [({}, False), (FLOAT32_BASE, True)])

@@ -1,4 +1,4 @@
-"""Validation ranks the actions of moves, selects by that rank, and may end a run early."""
+"""Validation: action ranking, selection of the best checkpoint, and early end of a run."""
 
 from pathlib import Path
 from typing import Any
@@ -26,10 +26,10 @@ def validations(folder: Path) -> list[dict[str, Any]]:
 
 @pytest.fixture
 def ranks_are(monkeypatch):
-    """Let each validation find these (error, rank) one after the other; the first are the base's."""
+    """Return a function that sets the (rollout error, ranking error) of validations, the base model's first."""
 
-    def use(*found: tuple[float, float]) -> None:
-        values = iter(found)
+    def use(*errors: tuple[float, float]) -> None:
+        values = iter(errors)
 
         def metrics(_: object) -> dict[str, float]:
             error, rank = next(values)
@@ -52,7 +52,7 @@ def test_each_validation_logs_the_ranking_with_intervals(make_config, reporter) 
     assert len({row["action_ranking_error"] for row in rows}) > 1
 
 
-def test_clips_that_cannot_be_read_are_replaced_in_the_ranking(make_config, reporter, monkeypatch) -> None:
+def test_unreadable_clips_are_replaced_in_the_ranking(make_config, reporter, monkeypatch) -> None:
     clips = {"validation__clips": 8, "validation__ranking_clips": 3, "data__broken_episodes": "skip"}
     run = set_up(make_config(**clips), reporter)
     names = [
@@ -60,8 +60,8 @@ def test_clips_that_cannot_be_read_are_replaced_in_the_ranking(make_config, repo
         for episode, start in loader.validation_windows(run.dataset, "validation", clips=8)
     ]
     chosen = [names[place] for place in spread_indices(8, 3)]
-    others = [name for name in names if name not in chosen]
-    ranked, broken, read = [], {*chosen[1:], others[0]}, loader.read_clip
+    unused = [name for name in names if name not in chosen]
+    ranked, broken, read = [], {*chosen[1:], unused[0]}, loader.read_clip
 
     def some_read(dataset: object, request: loader.ClipRequest) -> object:
         if (run.dataset.table.identity(request.episode), request.start) in broken:
@@ -74,7 +74,7 @@ def test_clips_that_cannot_be_read_are_replaced_in_the_ranking(make_config, repo
     monkeypatch.setattr(loader, "read_clip", some_read)
     monkeypatch.setattr(validation, "rank_actions", rank)
     validation.validate(run, reporter)
-    assert ranked == [name for name in (chosen[0], others[1], others[2]) for _ in range(2)], "two moves of each"
+    assert ranked == [name for name in (chosen[0], unused[1], unused[2]) for _ in range(2)], "two moves of each"
     broken.update(names)
     with pytest.raises(InputError, match="4 of 8 episodes are broken"):
         validation.validate(run, reporter)

@@ -178,9 +178,7 @@ class Mirror:
         self._started_s = -float("inf")
         self._target: str | None = None  # the newest local checkpoint when the thread started
         self._newest_uploaded: str | None = None  # the newest remote checkpoint
-        self._uploaded_starts: bytes | None = (
-            None  # the uploaded list of starts; another remote list means a later start
-        )
+        self._uploaded_starts: bytes | None = None  # if the remote list of starts differs, a later start wrote it
         self._outage_reported = self._is_lost = self._is_ending = self._has_ended = False
         shutil.rmtree(self._folder / UPLOAD_LINKS, ignore_errors=True)  # links of a killed process
 

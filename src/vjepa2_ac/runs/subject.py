@@ -32,9 +32,7 @@ class Subject:
 
     name: str  # the run folder, or the name of the model
     config: Config
-    world_model: (
-        WorldModel  # `load_for_planning` moves it to its device and merges the adapter; `load_subject` does neither
-    )
+    world_model: WorldModel  # from `load_for_planning` on its device, with merged adapter; from `load_subject` neither
     checkpoint: Path | None = None  # the checkpoint folder; None for a model
     chosen: str = ""  # description of the checkpoint; "" for a model
     is_base: bool = False  # the checkpoint has the weights of the base model
