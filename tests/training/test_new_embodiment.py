@@ -62,7 +62,7 @@ def test_new_robot_from_recordings_to_a_trained_model(
     evaluation = evaluate_subject(str(folder), QUICK)
     assert list(evaluation.models) == ["adapter" if kind == "lora" else "model"]
     metrics = metrics_as_dict(evaluation)
-    assert any("no base to compare with" in note for note in metrics["notes"])
+    assert any("The base model is not compared" in note for note in metrics["notes"])
     assert metrics["base"] is None
 
     with pytest.raises(InputError, match=f"states of {widths.state} and actions of {widths.action} numbers"):
