@@ -1,8 +1,8 @@
-"""Encode clips, predict their future, and compare with persistence: copying the last frame that was seen.
+"""Encode clips, predict their future, and compare with persistence (a copy of the last input frame).
 
     python examples/predict.py [DATA [MODEL]]
 
-Without DATA, a folder of DROID's RLDS form, a few episodes of the simulated arm are recorded first.
+DATA is a folder in DROID's RLDS format. Without it, a few episodes of the simulated arm are recorded first.
 """
 
 import sys
@@ -22,7 +22,7 @@ def error(predicted: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
 
 
 def main(data: str | None = None, model: str = "builtin:sim-tiny") -> None:
-    """Print the errors of one step and of a rollout beside those of persistence."""
+    """Print the errors of one step and of a rollout, and those of persistence."""
     if data is None and not RECORDED.exists():
         print("Recording 12 episodes of the simulated arm ...")
         record_dataset(RECORDED, RecordingSpec("B", steps=33, seed=4), episodes=12)
@@ -32,22 +32,24 @@ def main(data: str | None = None, model: str = "builtin:sim-tiny") -> None:
 
     rows = []
     for batch in read_clips(dataset, clips=32, batch_size=8):
-        seen = encode(world_model, batch)  # latents: clips x time x tokens x dim
-        first, true, states = seen.latents[:, :1], seen.latents[:, 1:], seen.states[:, :-1]
-        one_step = world_model.predict(seen.latents[:, :-1], seen.actions, states)  # from the true frames
-        rollout = world_model.rollout(first, seen.actions, states)  # from the first frame, predictions fed back
-        guesses = (one_step, seen.latents[:, :-1], rollout, first.expand_as(true))
-        rows.append(torch.stack([error(guess, true) for guess in guesses]))
+        encoded = encode(world_model, batch)  # latents: clips x time x tokens x dim
+        first, true, states = encoded.latents[:, :1], encoded.latents[:, 1:], encoded.states[:, :-1]
+        teacher_forced = world_model.predict(encoded.latents[:, :-1], encoded.actions, states)  # from the true frames
+        rollout = world_model.rollout(first, encoded.actions, states)  # from the first frame, predictions fed back
+        predictions = (teacher_forced, encoded.latents[:, :-1], rollout, first.expand_as(true))
+        rows.append(torch.stack([error(predicted, true) for predicted in predictions]))
 
     print("L1 error       one step  copy before  |  rollout  copy first  ratio")
-    for step, (one, before, rolled, copied) in enumerate(torch.stack(rows).mean(dim=0).T.tolist(), start=1):
-        print(f"{step * seconds:.2f} s ahead   {one:.4f}   {before:.4f}       |  ", end="")
-        print(f"{rolled:.4f}   {copied:.4f}      {rolled / copied:.3f}")
+    for step, (step_error, copied_before, rollout_error, copied_first) in enumerate(
+        torch.stack(rows).mean(dim=0).T.tolist(), start=1
+    ):
+        print(f"{step * seconds:.2f} s ahead   {step_error:.4f}   {copied_before:.4f}       |  ", end="")
+        print(f"{rollout_error:.4f}   {copied_first:.4f}      {rollout_error / copied_first:.3f}")
     print("A ratio below 1 is better than copying the first frame.")
 
 
 if __name__ == "__main__":
     try:
         main(*sys.argv[1:3])
-    except UserError as wrong:
-        sys.exit(f"error: {wrong}")
+    except UserError as exception:
+        sys.exit(f"error: {exception}")

@@ -38,21 +38,21 @@ TINY = "builtin:sim-tiny"
 # The names.
 
 
-def test_the_table_of_the_page_has_exactly_the_public_names() -> None:
+def test_api_page_lists_exactly_the_public_names() -> None:
     table = PAGE.split("| name | description |")[1].split("\n\n")[0]
     named = re.findall(r"^\| `(\w+)", table, flags=re.MULTILINE)
     assert sorted(named) == sorted(vjepa2_ac.__all__)
 
 
 @pytest.mark.parametrize("name", [name for name in vjepa2_ac.__all__ if name[0].islower()])
-def test_the_page_shows_the_parameters_of_each_function(name: str) -> None:
+def test_api_page_shows_the_parameters_of_each_function(name: str) -> None:
     (shown,) = re.findall(rf"^\| `{name}\((.*?)\)`", PAGE, flags=re.MULTILINE)
     parameters = inspect.signature(getattr(vjepa2_ac, name)).parameters.values()
     assert re.findall(r"\w+", shown) == [one.name for one in parameters]
     assert len(parameters) <= 6
 
 
-def test_importing_the_package_imports_next_to_nothing_and_dir_knows_the_names() -> None:
+def test_package_import_is_light_and_dir_lists_public_names() -> None:
     code = (
         "import os, sys\n"
         "before = dict(os.environ)\n"
@@ -94,7 +94,7 @@ def test_docs_code_runs(capsys: pytest.CaptureFixture[str]) -> None:
 # Models.
 
 
-def test_a_model_is_ready_to_predict() -> None:
+def test_loaded_model_is_in_eval_mode_and_predicts() -> None:
     model = load_model(TINY)
     assert (model.image_size, model.num_tokens, model.latent_dim) == (96, 36, 128)
     assert not model.training

@@ -132,7 +132,7 @@ def test_non_finite_weight_raises_with_its_name(copied, tmp_path: Path, kind: st
     assert not (tmp_path / "out").exists()
 
 
-def test_the_card_describes_base_data_and_training(
+def test_model_card_describes_base_data_and_training(
     trained, base_folder: Path, data_folder: Path, tmp_path: Path
 ) -> None:
     run = trained()
@@ -163,7 +163,7 @@ def test_names_are_escaped_in_the_model_card(trained, tmp_path: Path) -> None:
     assert "# x" not in outside
 
 
-def test_the_code_of_the_card_runs(trained, tmp_path: Path) -> None:
+def test_code_of_the_model_card_runs(trained, tmp_path: Path) -> None:
     run = trained(model__sizes=TINY_CONFIG)
     export_run(run, tmp_path / "hub", "hub")
     blocks = re.findall(r"```python\n(.*?)```", (tmp_path / "hub" / CARD).read_text(), flags=re.DOTALL)

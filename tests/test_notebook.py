@@ -55,7 +55,7 @@ def code() -> list[str]:
     return [cell.source for cell in nbformat.read(NOTEBOOK, as_version=4).cells if cell.cell_type == "code"]
 
 
-def test_one_line_is_all_that_changes() -> None:
+def test_notebook_needs_one_changed_line_for_other_data() -> None:
     cells = nbformat.read(NOTEBOOK, as_version=4).cells
     assert code()[0] == LINE
     assert [text for text in code() if re.search(r"^\s*MODEL\s*=", text, flags=re.MULTILINE)] == [LINE]
@@ -65,7 +65,7 @@ def test_one_line_is_all_that_changes() -> None:
 
 
 @pytest.mark.usefixtures("quiet")
-def test_it_runs_and_shows_its_figures(tmp_path: Path) -> None:
+def test_notebook_runs_and_shows_its_figures(tmp_path: Path) -> None:
     (tmp_path / "examples").mkdir()
     printed, images = executed(tmp_path)
     assert images == 6, "clips, errors by patch, two energies, loss, evaluation"

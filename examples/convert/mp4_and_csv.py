@@ -13,7 +13,7 @@ Columns of a table, in any order; other columns are ignored:
 
 Without `time`, row n belongs to frame n. With `time`, each frame gets the row that is nearest in time.
 
-Steps are evenly spaced in time. A video with uneven frame times is refused without --fps. With --fps, each step takes
+Steps are evenly spaced in time. A video with uneven frame times requires --fps. With --fps, each step takes
 the frame that is nearest in time, and the row of that frame. Poses are not interpolated, because an interpolated pose
 is not the pose that the frame shows.
 """
@@ -29,10 +29,10 @@ import av
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-FARTHEST_S = 0.1  # largest time between a frame and its row
-LARGEST_JITTER = 0.2  # largest difference between a frame interval and the mean interval, relative to the mean
-LARGEST_REPEATED_SHARE = 0.2  # largest share of steps that repeat the frame or the row of the step before
-SAME_RATE = 0.02  # an even video keeps all frames if --fps differs from its rate by a smaller share
+MAX_ROW_DISTANCE_S = 0.1  # largest time between a frame and its row
+MAX_JITTER = 0.2  # largest difference between a frame interval and the mean interval, relative to the mean
+MAX_REPEATED_SHARE = 0.2  # largest share of steps that repeat the frame or the row of the step before
+RATE_TOLERANCE = 0.02  # an even video keeps all frames if --fps differs from its rate by a smaller share
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 EULER, EULER_DEGREES, VECTOR = "euler_xyz", "euler_xyz_degrees", "rotation_vector"
@@ -43,7 +43,7 @@ ROTATION_COLUMNS = [  # names in lower case without dots, spaces and underscores
     *((f"{name}x {name}y {name}z", VECTOR) for name in ("rotvec", "axisangle", "rvec", "w")),
     *((f"{name}0 {name}1 {name}2", VECTOR) for name in ("rotvec", "axisangle", "rvec")),
     *((f"{name}1 {name}2 {name}3", VECTOR) for name in ("rotvec", "axisangle", "rvec")),
-    *((f"{name}x {name}y {name}z", None) for name in ("r", "rot")),  # None: only --rotation tells
+    *((f"{name}x {name}y {name}z", None) for name in ("r", "rot")),  # None: --rotation must name the format
     *((f"{name}0 {name}1 {name}2 {name}3", None) for name in ("q", "quat", "quaternion")),
     *((f"{name}1 {name}2 {name}3 {name}4", None) for name in ("q", "quat", "quaternion")),
 ]
@@ -81,15 +81,17 @@ def read_table(path: Path, options: argparse.Namespace) -> tuple[np.ndarray, np.
     if not rows:
         raise SystemExit(f"{path}: no rows. Expected a line with the names of the columns, then a row for each pose.")
     if missing := [name for name in ("x", "y", "z", "gripper") if name not in names]:
-        raise SystemExit(f"{path}: no column {', '.join(missing)}; it has {', '.join(header)}")
+        raise SystemExit(f"{path}: no column {', '.join(missing)}; the table has {', '.join(header)}")
     rotation, rotation_columns = choose_rotation(path, names, options.rotation)
     used = ["x", "y", "z", *rotation_columns, "gripper", *(["time"] if "time" in names else [])]
-    if doubled := [name for name in used if names.count(name) > 1]:
-        raise SystemExit(f"{path}: {names.count(doubled[0])} columns are called {doubled[0]}. Rename all but one.")
+    if duplicates := [name for name in used if names.count(name) > 1]:
+        raise SystemExit(
+            f"{path}: {names.count(duplicates[0])} columns are called {duplicates[0]}. Rename all but one."
+        )
     numbers = np.empty((len(rows), len(used)))
-    for row, (place, cells) in enumerate(rows):
+    for row, (location, cells) in enumerate(rows):
         if any(cells[len(header) :]):
-            raise SystemExit(f"{place}: {len(cells)} cells. Expected {len(header)}, as in the first line.")
+            raise SystemExit(f"{location}: {len(cells)} cells. Expected {len(header)}, as in the first line.")
         cells_by_name = dict(zip(names, cells, strict=False))
         for column, name in enumerate(used):
             cell = cells_by_name.get(name, "")
@@ -98,9 +100,9 @@ def read_table(path: Path, options: argparse.Namespace) -> tuple[np.ndarray, np.
             except ValueError:
                 numbers[row, column] = math.nan
             if not math.isfinite(numbers[row, column]):
-                found = repr(cell) if cell else "an empty cell"
-                raise SystemExit(f"{place}, column {header[names.index(name)]}: {found}. Expected a number.")
-    states = make_states([place for place, _ in rows], numbers[:, : 4 + len(rotation_columns)], rotation, options)
+                problem = repr(cell) if cell else "an empty cell"
+                raise SystemExit(f"{location}, column {header[names.index(name)]}: {problem}. Expected a number.")
+    states = make_states([location for location, _ in rows], numbers[:, : 4 + len(rotation_columns)], rotation, options)
     return states, numbers[:, -1] if "time" in names else None, f"{rotation} from {', '.join(rotation_columns)}"
 
 
@@ -109,10 +111,14 @@ def choose_rotation(path: Path, names: list[str], requested: str | None) -> tupl
     present = [(group.split(), implied) for group, implied in ROTATION_COLUMNS if set(group.split()) <= set(names)]
     if requested is not None:
         kind, width = requested.split("_")[0], 4 if requested in {XYZW, WXYZ} else 3
-        present = [one for one in present if (one[1] or requested).startswith(kind) and len(one[0]) == width]
+        present = [
+            (columns, implied)
+            for columns, implied in present
+            if (implied or requested).startswith(kind) and len(columns) == width
+        ]
     if not present:
         expected = requested or "roll, pitch, yaw, or qx, qy, qz, qw, or rotvec_x, rotvec_y, rotvec_z"
-        raise SystemExit(f"{path}: no columns for the rotation; it has {', '.join(names)}. Expected {expected}.")
+        raise SystemExit(f"{path}: no columns for the rotation; the table has {', '.join(names)}. Expected {expected}.")
     group, implied = present[0]
     rotation = implied if implied == XYZW else requested or implied  # qx, qy, qz, qw: the names give the order
     if rotation is None:
@@ -121,23 +127,23 @@ def choose_rotation(path: Path, names: list[str], requested: str | None) -> tupl
     return rotation, group
 
 
-def make_states(places: list[str], numbers: np.ndarray, rotation: str, options: argparse.Namespace) -> np.ndarray:
-    """Return the states, [rows, 7], from x, y, z, the rotation and the gripper as the table has them."""
+def make_states(locations: list[str], numbers: np.ndarray, rotation: str, options: argparse.Namespace) -> np.ndarray:
+    """Return the states, [rows, 7], from x, y, z, the rotation and the gripper as they are in the table."""
     positions, rotations = numbers[:, :3] * METRES[options.position_unit], numbers[:, 3:-1]
     gripper = (numbers[:, -1:] - options.gripper_open) / (options.gripper_closed - options.gripper_open)
     if rotation in {XYZW, WXYZ}:
         is_rotation = abs(np.linalg.norm(rotations, axis=1) - 1) <= 0.01
     else:
         is_rotation = abs(rotations).max(axis=1) <= 1.02 * (360 if rotation == EULER_DEGREES else 2 * math.pi)
-    for is_right, part, expected in (
+    for is_valid, part, expected in (
         (abs(positions).max(axis=1) <= 5, numbers[:, :3], "a position within 5 m of the base. Check --position-unit"),
         (is_rotation, rotations, f"{rotation} (a unit quaternion, or angles in its unit). Check --rotation"),
         (abs(gripper[:, 0] - 0.5) <= 0.6, numbers[:, -1:], "a gripper of 0 to 1. Set --gripper-open, --gripper-closed"),
     ):
-        if not is_right.all():
-            row = int(is_right.argmin())
-            found = ", ".join(f"{number:g}" for number in part[row])
-            raise SystemExit(f"{places[row]}: {found}. Expected {expected}.")
+        if not is_valid.all():
+            row = int(is_valid.argmin())
+            problem = ", ".join(f"{number:g}" for number in part[row])
+            raise SystemExit(f"{locations[row]}: {problem}. Expected {expected}.")
     if rotation in {XYZW, WXYZ}:
         rotations = np.roll(rotations, -1, axis=1) if rotation == WXYZ else rotations
         rotations = Rotation.from_quat(rotations).as_euler("xyz")
@@ -184,26 +190,28 @@ def decode_upright(path: Path, frame: av.VideoFrame, height: int) -> np.ndarray:
 def match_rows(path: Path, row_times: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the row of each frame, and the times of the frames, for a table with times."""
     duration = row_times[-1] - row_times[0]
-    if len(row_times) == len(times) and abs(duration - times[-1]) > FARTHEST_S and np.diff(row_times).min() > 0:
-        found = f"a row for each frame, but `time` covers {duration:.2f} s and the video {times[-1]:.2f} s"
-        print(f"warning: {path}: {found}; row n is used for frame n, and `time` as the time of both")
+    if len(row_times) == len(times) and abs(duration - times[-1]) > MAX_ROW_DISTANCE_S and np.diff(row_times).min() > 0:
+        problem = f"a row for each frame, but `time` covers {duration:.2f} s and the video {times[-1]:.2f} s"
+        print(f"warning: {path}: {problem}; row n is used for frame n, and `time` as the time of both")
         return np.arange(len(times)), row_times - row_times[0]
     rows = find_nearest(row_times, times)
-    if (farthest := abs(row_times[rows] - times).max()) > FARTHEST_S:
-        raise SystemExit(f"{path}: a frame is {farthest:.2f} s from the nearest row; is `time` 0 at the first frame?")
+    if (farthest := abs(row_times[rows] - times).max()) > MAX_ROW_DISTANCE_S:
+        raise SystemExit(
+            f"{path}: a frame is {farthest:.2f} s from the nearest row. Expected at most {MAX_ROW_DISTANCE_S} s. Set `time` to 0 at the first frame."
+        )
     return rows, times
 
 
 def choose_steps(path: Path, times: np.ndarray, fps: float | None) -> tuple[np.ndarray, float]:
     """Return the frame of each step, and the number of steps per second."""
     gaps, measured = np.diff(times), (len(times) - 1) / times[-1]
-    is_even = abs(gaps * measured - 1).max() <= LARGEST_JITTER
-    if is_even and (fps is None or abs(fps / measured - 1) <= SAME_RATE):
+    is_even = abs(gaps * measured - 1).max() <= MAX_JITTER
+    if is_even and (fps is None or abs(fps / measured - 1) <= RATE_TOLERANCE):
         return np.arange(len(times)), fps or round(measured, 2)
     if fps is None:
-        found = f"{path}: frames are {gaps.min():.3f} to {gaps.max():.3f} s apart"
+        problem = f"{path}: frames are {gaps.min():.3f} to {gaps.max():.3f} s apart"
         fix = f"Pass --fps N to resample; up to {0.99 / gaps.max():.3g} no step repeats a frame"
-        raise SystemExit(f"{found}. Expected even times (within {LARGEST_JITTER:.0%}). {fix}.")
+        raise SystemExit(f"{problem}. Expected even times (within {MAX_JITTER:.0%}). {fix}.")
     return find_nearest(times, np.arange(int(times[-1] * fps + 1e-6) + 1) / fps), fps
 
 
@@ -216,14 +224,14 @@ def find_nearest(times: np.ndarray, targets: np.ndarray) -> np.ndarray:
     return np.asarray(indices[np.where(is_before, before, after)])
 
 
-def report_repeats(path: Path, indices: np.ndarray, what: str) -> None:
-    """Print how many steps repeat the frame or the row of the step before; refuse many."""
+def report_repeats(path: Path, indices: np.ndarray, item: str) -> None:
+    """Print how many steps repeat the frame or the row of the step before; exit if there are too many."""
     repeated = np.count_nonzero(np.diff(indices) == 0)
-    found = f"{path}: {repeated} of {len(indices)} steps repeat the {what} of the step before"
-    if repeated > LARGEST_REPEATED_SHARE * len(indices):
-        raise SystemExit(f"{found}. Expected {LARGEST_REPEATED_SHARE:.0%} at most. Pass a lower --fps.")
+    problem = f"{path}: {repeated} of {len(indices)} steps repeat the {item} of the step before"
+    if repeated > MAX_REPEATED_SHARE * len(indices):
+        raise SystemExit(f"{problem}. Expected {MAX_REPEATED_SHARE:.0%} at most. Pass a lower --fps.")
     if repeated:
-        print(f"warning: {found}")
+        print(f"warning: {problem}")
 
 
 def main() -> None:
@@ -241,15 +249,17 @@ def main() -> None:
     if args.gripper_open == args.gripper_closed or (args.fps is not None and args.fps <= 0):
         parser.error("--gripper-open and --gripper-closed must differ, and --fps must be positive")
     recordings = find_recordings(args.recordings)
-    tables = [read_table(table, args) for _, table in recordings]  # all, before the first video is decoded
+    tables = [
+        read_table(table, args) for _, table in recordings
+    ]  # all tables are checked before the first video is decoded
     for number, ((video, table), (states, row_times, rotation)) in enumerate(zip(recordings, tables, strict=True)):
         frames, times = read_video(video, args.height)
         rows = np.arange(len(states))
         if row_times is not None:
             rows, times = match_rows(table, row_times, times)
         elif len(states) != len(times):
-            found = f"{table}: {len(states)} rows for {len(times)} frames"
-            raise SystemExit(f"{found}; a column `time` says which go together")
+            problem = f"{table}: {len(states)} rows for {len(times)} frames"
+            raise SystemExit(f"{problem}. Expected one row per frame. Add a column `time` to match rows to frames.")
         steps, rate = choose_steps(video, times, args.fps)
         report_repeats(video, steps, "frame")
         report_repeats(table, rows[np.unique(steps)], "row")

@@ -1,9 +1,9 @@
-"""V-JEPA 2-AC as a cost of stable-worldmodel (its `Costable`): its solvers search, our model predicts.
+"""V-JEPA 2-AC as a cost function (`Costable`) for the solvers of stable-worldmodel.
 
     from stable_worldmodel.solver import CEMSolver
     solver = CEMSolver(WorldModelCost(Controller.of_run(load_run("demo/run"))), num_samples=64)
 
-Actions are changes of a model step: metres, radians, closedness (`vjepa2_ac.episode`), not normalised.
+Actions are changes per model step in metres, radians and closedness (`vjepa2_ac.episode`); they are not normalised.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from vjepa2_ac import Controller
 
 
 class WorldModelCost:
-    """Energies of candidate actions, by the controller that plans with the model.
+    """Compute the energies of candidate actions with the controller that plans with the model.
 
     Args:
-        controller: Of a run or a model; it is reset.
-        pixels: Key of the present image in `info`: environments x (time x) height x width x 3, uint8, RGB.
-        goal: Key of the goal image, likewise.
+        controller: Controller of a run or a model; each call resets it.
+        pixels: Key of the current image in `info`: environments x (time x) height x width x 3, uint8, RGB.
+        goal: Key of the goal image, with the same shape.
         state: Key of the measured state, environments x (time x) numbers.
     """
 
@@ -32,24 +32,24 @@ class WorldModelCost:
         self._controller, self._keys = controller, (pixels, goal, state)
 
     def get_cost(self, info_dict: dict[str, Any], action_candidates: torch.Tensor) -> torch.Tensor:
-        """Return costs, environments x samples, of actions, environments x samples x model steps x numbers.
+        """Return costs, environments x samples, for actions, environments x samples x model steps x components.
 
         Args:
-            info_dict: As a solver gives it: each value repeated for every sample, of which the first is read.
-            action_candidates: What is to be scored.
+            info_dict: The solver's input; each value is repeated for every sample, and the first copy is read.
+            action_candidates: The actions to score.
         """
         costs = []
-        for place, chunks in enumerate(action_candidates):
-            image, goal, state = (_latest(info_dict[key][place][0], key == self._keys[2]) for key in self._keys)
+        for environment, chunks in enumerate(action_candidates):
+            image, goal, state = (_latest(info_dict[key][environment][0], key == self._keys[2]) for key in self._keys)
             self._controller.reset(goal.astype(np.uint8))
-            found = self._controller.score(image.astype(np.uint8), state, chunks.detach().cpu().double().numpy())
-            costs.append(torch.from_numpy(found.energies))
+            result = self._controller.score(image.astype(np.uint8), state, chunks.detach().cpu().double().numpy())
+            costs.append(torch.from_numpy(result.energies))
         return torch.stack(costs).to(action_candidates)
 
     criterion = get_cost
 
 
-def _latest(found: Any, is_state: bool) -> np.ndarray:
-    """Return the newest of several moments, or the only one."""
-    values = np.asarray(found.cpu() if isinstance(found, torch.Tensor) else found)
+def _latest(value: Any, is_state: bool) -> np.ndarray:
+    """Return the latest entry of a time axis, or the value itself without a time axis."""
+    values = np.asarray(value.cpu() if isinstance(value, torch.Tensor) else value)
     return values[-1] if values.ndim > (1 if is_state else 3) else values

@@ -1,11 +1,11 @@
-"""A Franka arm, moved by franky (`pip install franky-control`), and planned for by a server.
+"""Drive a Franka arm through franky (`pip install franky-control`) with plans from a server.
 
     vjepa2-ac serve RUN --actions pose --goals goals --host ADDRESS --key-file key \
         planning.limits.xyz=[0.01,0.01,0.01] planning.limits.workspace=[[0.3,-0.3,0.2],[0.7,0.3,0.6]]
-    python franky_client.py ARM SERVER KEY cup        # beside: pip install openpi-client typing_extensions scipy
+    python franky_client.py ARM SERVER KEY cup        # needs: pip install openpi-client typing_extensions scipy
 
-Make `camera` return an RGB image of the goal's size: height x width x 3, uint8. Keep a hand on the emergency stop. An
-error of the server, or of the arm, ends the loop: the arm stays where it is.
+Make `camera` return an RGB image with the size of the goal image (height x width x 3, uint8). Keep a hand on the
+emergency stop. An error of the server or of the arm ends the loop, and the arm stops.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-SPEED_M_S, FORCE_N = 0.05, 20.0  # of the gripper
+SPEED_M_S, FORCE_N = 0.05, 20.0  # speed and force of the gripper
 
 
 def drive(robot: Any, gripper: Any, policy: Any, camera: Callable[[], np.ndarray], goal: str, steps: int = 30) -> None:
-    """Let the server move the arm to a goal that it keeps, one model step at a time."""
+    """Move the arm to a goal that is stored on the server, one model step at a time."""
     from franky import Affine, CartesianMotion
 
     for step in range(steps):
         tool = robot.state.F_T_EE  # the server plans for the flange, franky moves the tool
-        answer = policy.infer(seen(camera(), robot.state.O_T_EE * tool.inverse, gripper) | asked(goal, step))
+        answer = policy.infer(observe(camera(), robot.state.O_T_EE * tool.inverse, gripper) | goal_request(goal, step))
         x, y, z, *angles, closedness = answer["actions"][-1]  # the target, within the server's limits and workspace
         print(f"{step}: {answer['why']}, energy {answer['energy']['now']}, to {x:.3f} {y:.3f} {z:.3f}")
         if answer["done"]:
             break
         flange = Affine([x, y, z], Rotation.from_euler("xyz", angles).as_quat())
-        robot.move(CartesianMotion(flange * tool))  # returns when the arm is there
+        robot.move(CartesianMotion(flange * tool))  # returns when the arm has reached the pose
         grip(gripper, closedness)
 
 
-def seen(image: np.ndarray, flange: Any, gripper: Any) -> dict[str, Any]:
-    """Return the picture, and what was measured."""
+def observe(image: np.ndarray, flange: Any, gripper: Any) -> dict[str, Any]:
+    """Return the image and the measured state as fields of a request."""
     angles = Rotation.from_quat(flange.quaternion).as_euler("xyz")
     pose = np.concatenate([np.ravel(flange.translation), angles])
     closed = np.clip(1.0 - gripper.width / gripper.max_width, 0.0, 1.0)
@@ -48,13 +48,13 @@ def seen(image: np.ndarray, flange: Any, gripper: Any) -> dict[str, Any]:
     }
 
 
-def asked(goal: str, step: int) -> dict[str, Any]:
-    """Return the goal, and that an episode begins with the first step."""
+def goal_request(goal: str, step: int) -> dict[str, Any]:
+    """Return the fields for the goal, and for the start of an episode at the first step."""
     return {"prompt": goal, "reset": step == 0}
 
 
 def grip(gripper: Any, closedness: float) -> None:
-    """Close around whatever is there, open, or leave the fingers alone."""
+    """Grasp, open, or leave the fingers unchanged if the change is small."""
     change = closedness - np.clip(1.0 - gripper.width / gripper.max_width, 0.0, 1.0)
     if change > 0.05:
         gripper.grasp(0.0, SPEED_M_S, FORCE_N, epsilon_outer=1.0)
@@ -63,7 +63,7 @@ def grip(gripper: Any, closedness: float) -> None:
 
 
 def main(arm: str, server: str, key: str, goal: str) -> None:
-    """Connect to the arm and to the server, and drive."""
+    """Connect to the arm and the server, and run the control loop."""
     from franky import Gripper, Robot
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
 

@@ -51,7 +51,7 @@ def main(url: str, film: str, episodes: str = "4", seed: str = "3") -> None:
     options = BenchmarkOptions("pick", "A", count, int(seed), steps=18)
     arm, trials, limits = arm_for("pick", options.world), options.trials(), LimitsConfig()
     trials = with_goals(trials, [demonstrated_goals(one, arm, limits, "every-step") for one in trials.trials])
-    result = run_trials(ArmEnvironment(arm), ServedPlanner(WebsocketClientPolicy(url)), trials, films=count)
+    result = run_trials(ArmEnvironment(arm), ServedPlanner(WebsocketClientPolicy(url)), trials, num_videos=count)
     for number, episode in enumerate(result.episodes, start=1):
         print(
             f"problem {number}: {100 * episode.distances_m[-1]:.1f} cm left, {'lifted' if episode.success else 'not'}"

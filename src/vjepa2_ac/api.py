@@ -146,8 +146,8 @@ def encode(
         return encode_batch(model, clips, device=model.device, chunk=chunk)
     frames = np.asarray(clips)
     if frames.dtype != np.uint8 or frames.ndim < 3 or frames.shape[-1] != 3 or 0 in frames.shape:
-        found = f"{frames.dtype} with shape {' x '.join(map(str, frames.shape))}"
-        raise InputError(where="encode", found=found, needed="RGB frames: uint8, ... x height x width x 3")
+        problem = f"{frames.dtype} with shape {' x '.join(map(str, frames.shape))}"
+        raise InputError(where="encode", found=problem, needed="RGB frames: uint8, ... x height x width x 3")
     latents = encode_frames(model, frames.reshape(-1, *frames.shape[-3:]), crop, chunk=chunk)
     return latents.reshape(*frames.shape[:-3], *latents.shape[-2:])
 
@@ -180,19 +180,19 @@ def load_model(
         >>> model.image_size, model.num_tokens, model.latent_dim  # pixels, tokens of a frame, width of a token
         (96, 36, 128)
     """
-    place = _device(device)
-    has_bfloat16 = place.type == "cuda" and has_bf16(place)
+    torch_device = _device(device)
+    has_bfloat16 = torch_device.type == "cuda" and has_bf16(torch_device)
     model_values: dict[str, Any] = {
         "dtype": ("bfloat16" if has_bfloat16 else "float32") if dtype == "auto" else dtype,
         "sizes": (sizes or SizesConfig()).model_dump(),
         "encoder": encoder.model_dump() if isinstance(encoder, EncoderConfig) else encoder and {"path": str(encoder)},
     }
     config = config_of_model(str(name), where="load_model", **model_values).model
-    require_weight_dtype(config, place)
+    require_weight_dtype(config, torch_device)
     model = load_base(config, seed=0)
     if adapter is not None:
         load_trained(model, adapter, trainable=False)
-    return model.to(place).eval()
+    return model.to(torch_device).eval()
 
 
 def load_run(
@@ -223,8 +223,8 @@ def load_run(
     """
     torch_device, folder = _device(device), Path(folder)
     if not is_run(str(folder)) and (folder / ADAPTER_FILE).is_file():
-        found, fix = "an adapter without its run", "Load it with its base model: load_model(BASE, adapter=FOLDER)"
-        raise InputError(where=str(folder), found=found, needed="the folder of a run", fix=fix)
+        problem, fix = "an adapter without its run", "Load it with its base model: load_model(BASE, adapter=FOLDER)"
+        raise InputError(where=str(folder), found=problem, needed="the folder of a run", fix=fix)
     run = load_subject(folder, str(checkpoint), config=read_config_of_moved_run(folder, overrides))
     run.world_model.to(torch_device)
     return run

@@ -78,9 +78,9 @@ def export_run(
     config = read_config_of_moved_run(folder, overrides)
     kind = config.adapter.kind
     if form == "hub" and kind != "lora":
-        found, needed = f"a run without an adapter (adapter.kind: {kind})", "adapter.kind: lora, for --to hub"
+        problem, needed = f"a run without an adapter (adapter.kind: {kind})", "adapter.kind: lora, for --to hub"
         fix = "Export the whole model with --to merged or --to official"
-        raise InputError(where=str(folder), found=found, needed=needed, fix=fix)
+        raise InputError(where=str(folder), found=problem, needed=needed, fix=fix)
     metrics = read_metrics(folder) if form == "hub" and (folder / METRICS_FILE).exists() else None
     run = load_subject(folder, checkpoint, config=config)
     assert run.checkpoint is not None  # noqa: S101  # a run always has a checkpoint
@@ -105,8 +105,8 @@ def export_run(
 def _check_free(destination: Path, form: Form) -> None:
     """Check that a destination is free and can be written. Changes nothing."""
     if destination.suffix == ".pt" and form != "official" and not destination.is_dir():
-        found = "a path that ends in .pt"
-        raise InputError(where=str(destination), found=found, needed=f"a folder, for --to {form}")
+        problem = "a path that ends in .pt"
+        raise InputError(where=str(destination), found=problem, needed=f"a folder, for --to {form}")
     require_new_folder(destination)
     with translate_write_errors(destination):
         check_local_writable(destination)

@@ -15,7 +15,7 @@ Load = Callable[[str], Any]
 # ---- rows ----
 
 
-def test_a_row_is_on_disk_as_soon_as_it_is_there_and_what_is_unfinished_is_marked(load: Load, tmp_path: Path) -> None:
+def test_each_row_is_written_at_once_and_unfinished_results_are_marked(load: Load, tmp_path: Path) -> None:
     file = tmp_path / "results" / "rows.json"
     table = load("rows").Rows(file, torch="2")
     table.add({"way": "a", "ms": math.nan})
@@ -27,7 +27,7 @@ def test_a_row_is_on_disk_as_soon_as_it_is_there_and_what_is_unfinished_is_marke
     assert list(file.parent.iterdir()) == [file]
 
 
-def test_what_fails_is_a_row_and_the_end_is_an_error_but_out_of_memory_is_a_result(
+def test_failed_part_gives_a_row_and_an_error_status_but_out_of_memory_is_a_result(
     load: Load, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def runs_out() -> None:
@@ -62,7 +62,7 @@ def test_what_fails_is_a_row_and_the_end_is_an_error_but_out_of_memory_is_a_resu
         ("print('hello')", None, "JSONDecodeError: Expecting value: line 1 column 1 (char 0)"),
     ],
 )
-def test_on_a_cpu_a_peak_is_of_a_process_of_its_own_whatever_becomes_of_it(
+def test_cpu_peak_memory_is_measured_in_a_separate_process_even_if_it_fails(
     load: Load, program: str, peak: float | None, problem: str | None
 ) -> None:
     found = load("memory").peak_alone([].pop, ["-c", program], "cpu")

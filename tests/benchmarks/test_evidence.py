@@ -38,7 +38,7 @@ def stored(evidence: Any) -> list[dict[str, Any]]:
     return json.loads((evidence.results.KEPT / "methods.json").read_text())
 
 
-def test_cells_have_names_of_their_own_and_one_can_be_made_of_each_stored_result(evidence: Any, stored: Any) -> None:
+def test_condition_names_are_unique_and_each_stored_result_has_a_condition(evidence: Any, stored: Any) -> None:
     cells = list(evidence.methods.all_cells(at_most=5))
     assert len({cell.name for cell in cells}) == len(set(cells)) == len(cells)
     assert not any("/" in cell.name for cell in cells), "names of files"
@@ -50,7 +50,7 @@ def test_cells_have_names_of_their_own_and_one_can_be_made_of_each_stored_result
     assert {cell.name for cell in checkpoints} <= {evidence.selection.name_of(one) for one in selection}
 
 
-def test_tables_of_the_page_are_those_of_the_stored_results(evidence: Any, stored: Any) -> None:
+def test_tables_of_the_page_equal_the_stored_results(evidence: Any, stored: Any) -> None:
     page = (ROOT / "docs/evidence.md").read_text()
     assert evidence.tables.summary(stored) in page
     assert evidence.tables.summary_of_tasks(stored) in page
@@ -91,7 +91,7 @@ def small(evidence: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[A
 
 
 @pytest.mark.parametrize("method", ["LoRA r4 + in/out", "zero-shot", "behaviour cloning"])
-def test_a_cell_is_trained_and_measured(small: Any, method: str) -> None:
+def test_experimental_condition_is_trained_and_measured(small: Any, method: str) -> None:
     base = "none" if method == "behaviour cloning" else "many cameras"
     cell = small.methods.Cell("look", base, method, 0 if method == "zero-shot" else 4, 0)
     figures = json.loads(json.dumps(small.measure.measure(cell, small.folder, 1)))

@@ -40,7 +40,7 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return {"rows": rows, "facts": json.loads(done.stdout.splitlines()[-1])}
 
 
-def test_bytes_and_waits_of_known_tensors_are_counted_exactly(counted: dict[str, Any]) -> None:
+def test_bytes_and_synchronizations_of_known_tensors_are_exact(counted: dict[str, Any]) -> None:
     assert counted["facts"] == {
         "live": MEBIBYTE + 1024, "peak": MEBIBYTE + 1024, "live, of a view": 1024,
         "kept for the backward pass": 2 * MEBIBYTE + 512,  # weights, output of exp, and the loss
@@ -49,7 +49,7 @@ def test_bytes_and_waits_of_known_tensors_are_counted_exactly(counted: dict[str,
     }  # fmt: skip
 
 
-def test_a_training_step_waits_only_for_its_losses_and_for_the_norm_of_its_gradients(counted: dict[str, Any]) -> None:
+def test_training_step_synchronizes_only_for_losses_and_gradient_norm(counted: dict[str, Any]) -> None:
     assert [(row["source"], row["waits"]) for row in counted["rows"]["quick"]] == [("cache", 2), ("pixels", 2)]
 
 

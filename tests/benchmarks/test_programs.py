@@ -33,7 +33,7 @@ ENCODERS = [one for one in PUBLISHED if one.holds == "encoder"]
         ),
     ],
 )
-def test_it_runs_to_its_end(
+def test_benchmark_program_runs_to_completion(
     name: str,
     options: str,
     printed: str,
@@ -85,7 +85,7 @@ def test_every_part_is_a_command_of_its_benchmark(load: Load) -> None:
             assert {way.split("+")[0] for way in named} <= set(get_args(AttentionKind))
 
 
-def test_commands_of_the_notes_can_be_given(load: Load) -> None:
+def test_commands_of_the_notes_are_valid(load: Load) -> None:
     commands = re.findall(r"python (benchmarks/\w+\.py[^`]*)`", SECTION)
     assert len(commands) > 1
     for script, *given in map(shlex.split, commands):

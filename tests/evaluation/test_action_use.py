@@ -98,7 +98,7 @@ class _Taught(Oracle):
         return super().predict(latents, actions.clamp(0.0, 0.01), states, extrinsics)
 
 
-def test_predictor_that_knows_only_short_forward_steps_has_a_ranking_error() -> None:
+def test_predictor_for_short_forward_steps_only_has_a_ranking_error() -> None:
     """The trap: on the steps of the data the model is perfect, and a planner has nothing to go by beyond them."""
     batch = line()
     own_steps = batch.latents[:, :-1], batch.actions, batch.states
@@ -233,7 +233,7 @@ def test_the_minimum_of_an_analytic_energy_is_at_the_true_action() -> None:
     assert found.chance_distance > 5.0
 
 
-def test_the_energy_at_a_node_is_that_of_its_action() -> None:
+def test_energy_at_a_grid_point_equals_the_energy_of_its_action() -> None:
     one = landscapes(Oracle()).maps[0]
     i, j, k = 2, 5, 1
     tried = np.array([one.axes[0, i], one.axes[1, j], one.axes[2, k]])

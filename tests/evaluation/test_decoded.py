@@ -93,7 +93,7 @@ def of(found: DecodedRollouts, source: str) -> dict[str, list[float]]:
     return {metric: [one.value for one in curve] for metric, curve in curves.items()}
 
 
-def test_a_perfect_predictor_equals_the_decoded_truth_bit_for_bit_and_a_copier_decoded_persistence(
+def test_perfect_predictor_equals_decoded_truth_and_copying_equals_decoded_persistence(
     oracle: DecodedRollouts,
 ) -> None:
     assert oracle.sources == (*NEIGHBOURS, "base", "adapter")
@@ -133,7 +133,7 @@ def test_cached_latents_are_not_compared_with_true_frames() -> None:
     assert found.sources == (DECODED_TRUTH, DECODED_PERSISTENCE, "adapter")
 
 
-def test_the_images_of_examples_begin_with_the_given_frame() -> None:
+def test_decoded_strips_start_with_the_input_frame() -> None:
     example = Example("best", BATCH.episode_ids[3], BATCH.starts[3], None, {})
     found = measure_decoded(evaluated_models(Oracle()), clips(BATCH, TRAINED), TRAINED, [example])
     (strip,) = found.strips

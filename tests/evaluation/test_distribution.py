@@ -54,7 +54,7 @@ def test_latents_as_varied_as_the_truth_have_spread_1() -> None:
     assert (one.value, other.value) == pytest.approx((1, 1))
 
 
-def test_mmd_is_of_latents_averaged_over_tokens_and_fvd_over_frames_too() -> None:
+def test_mmd_averages_latents_over_tokens_and_fvd_also_over_frames() -> None:
     predicted, true = latents(1, spread=0.5), latents(2)
     found = compare_distributions(summed(predicted), summed(true))
     pooled = [values.mean(dim=2).double().numpy() for values in (predicted, true)]
@@ -63,7 +63,7 @@ def test_mmd_is_of_latents_averaged_over_tokens_and_fvd_over_frames_too() -> Non
     assert frechet_distance_of_halves(summed(true)) > 0
 
 
-def test_one_clip_has_no_distribution_and_one_episode_no_interval() -> None:
+def test_single_clip_has_no_distribution_and_single_episode_no_interval() -> None:
     alone = LatentSums()
     alone.add(latents(1)[:1], IDS[:1])
     found = compare_distributions(alone, alone)
@@ -79,7 +79,7 @@ def test_one_clip_has_no_distribution_and_one_episode_no_interval() -> None:
 
 
 @pytest.mark.parametrize("count", [400, 6])
-def test_the_frechet_distance_equals_the_formula_with_a_matrix_root_also_for_few_clips(count: int) -> None:
+def test_frechet_distance_equals_the_matrix_root_formula_for_few_and_many_clips(count: int) -> None:
     rng = np.random.default_rng(0)
     one, other = rng.standard_normal((count, 8)), 0.5 + 1.5 * rng.standard_normal((count + 1, 8)) * np.arange(1, 9)
     left, right = (np.cov(values, rowvar=False) for values in (one, other))
@@ -143,7 +143,7 @@ def test_mmd_interval_contains_a_real_difference() -> None:
     assert found.low > 0
 
 
-def test_the_estimate_is_the_sum_over_pairs_of_clips_of_different_episodes() -> None:
+def test_mmd_equals_the_sum_over_clip_pairs_from_different_episodes() -> None:
     rng = np.random.default_rng(1)
     predicted, true = rng.standard_normal((2, 7, 5))
     ids = ["a", "b", "a", "c", "b", "b", "c"]

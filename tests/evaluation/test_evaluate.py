@@ -72,7 +72,7 @@ def test_a_perfect_predictor_scores_zero_in_every_metric(oracle: Evaluation) -> 
     assert found.uses_actions.conclusion == "yes"
 
 
-def test_spread_and_discrepancy_of_the_rollouts_are_those_of_the_predicted_latents() -> None:
+def test_spread_and_mmd_equal_those_of_the_predicted_latents() -> None:
     found = evaluated(Halfway(), Oracle())
     batch = clips_batch()
     predicted = Halfway().rollout(batch.latents[:, :1], batch.actions, batch.states)

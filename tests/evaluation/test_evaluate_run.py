@@ -142,7 +142,7 @@ def test_other_runs_are_measured_on_the_same_latents(run: str, tmp_path: Path, b
     assert evaluate_subject(run, asked_without).base is None
 
 
-def test_another_encoder_cannot_be_measured_on_these_latents(run: str, tmp_path: Path, base_folder: Path) -> None:
+def test_measuring_a_run_with_another_encoder_raises(run: str, tmp_path: Path, base_folder: Path) -> None:
     model = WorldModel.from_pretrained(base_folder)
     WorldModel.random(model.sizes, seed=9).save_pretrained(tmp_path / "other")
     with pytest.raises(InputError, match=r"an encoder that differs from that of.*vjepa2-ac compare"):
@@ -256,7 +256,7 @@ def test_a_decoder_adds_rows_and_images_and_changes_nothing_else(
     assert "Decoded images compared with the truth: PSNR (dB), whole image" in page
 
 
-def test_from_a_cache_decoded_images_are_compared_with_the_decoded_truth_and_encoded_again(
+def test_decoded_images_from_a_latent_cache_are_compared_with_decoded_truth(
     config: Config, decoder: str, tmp_path: Path
 ) -> None:
     encode_for(config, load_base(config.model, seed=0), open_dataset(config.data))

@@ -113,7 +113,7 @@ def test_better_prediction_needs_a_lower_error_than_the_base_model_and_persisten
     assert (summary.sentence == denied) == (conclusion == "no")
 
 
-def test_an_interval_has_the_direction_of_its_statement() -> None:
+def test_interval_has_the_sign_of_the_statement() -> None:
     for adapter, word in ((0.9, "lower"), (1.1, "higher")):
         predicts = summary_of(model("base", 1.0), model("adapter", adapter)).predicts
         low, high = map(float, predicts.interval.strip("[]").split(","))
@@ -211,7 +211,7 @@ def test_too_few_episodes_give_numbers_without_conclusions(episodes: int) -> Non
     assert "[" not in str(summary), "an interval over so few episodes means nothing"
 
 
-def test_a_measurement_of_fewer_episodes_than_the_evaluation_has_no_conclusion_alone() -> None:
+def test_measurement_on_too_few_episodes_has_no_conclusion() -> None:
     adapter = ranked("adapter", 0.7, 0.6, shuffled=0.9)
     few = replace(adapter, ranking=ranking_of(np.array([0.6, 0.6]), ("episode 1", "episode 2")))
     summary = summary_of(few, episodes=8)
@@ -233,7 +233,7 @@ def with_spread(result: ModelResult, spread: float) -> ModelResult:
 @pytest.mark.parametrize("with_base", [True, False])
 @pytest.mark.parametrize("level", [0.5, 0.995, 1.2])
 @pytest.mark.parametrize("spread", [0.5, 0.895, 0.9, 0.95, 1.1])
-def test_blur_is_named_exactly_where_error_and_spread_both_fell(with_base: bool, level: float, spread: float) -> None:
+def test_blur_is_reported_only_if_error_and_spread_both_decrease(with_base: bool, level: float, spread: float) -> None:
     adapter = with_spread(model("adapter", level, noise=0.0), spread)
     base_model = [with_spread(model("base", 1.0, noise=0.0), 0.9)] * with_base
     summary = summary_of(*base_model, adapter, copies=adapter.distribution)
@@ -299,7 +299,7 @@ def test_predictions_that_are_not_finite_have_no_conclusion() -> None:
 
 
 @pytest.mark.parametrize("distance", [10.0, 20.3])
-def test_the_sentence_names_a_landscape_that_is_not_better(distance: float) -> None:
+def test_sentence_mentions_a_landscape_that_is_not_better(distance: float) -> None:
     base = with_landscape(ranked("base", 1.0, 0.05), 13.8, 0.072)
     sentence = summary_of(base, with_landscape(ranked("adapter", 0.7, 0.02, shuffled=0.9), distance, 0.0086)).sentence
     assert sentence.startswith("Better prediction than the base model")
@@ -321,7 +321,7 @@ def with_errors(found: Evaluation, name: str, true: dict[Metric, np.ndarray]) ->
     return replace(found, models={**found.models, name: changed})
 
 
-def test_another_metric_that_contradicts_l1_is_named() -> None:
+def test_metric_that_contradicts_l1_is_reported() -> None:
     agreed = evaluation(model("base", 0.95), model("adapter", 0.8))
     assert not summarize(agreed, make_rows(agreed)).predicts.reference
     denied = with_errors(agreed, "adapter", by(0.8, 1.25))
@@ -351,7 +351,7 @@ def test_a_closed_loop_is_compared_with_policies_that_receive_no_image(
     assert plans.statement.endswith(f"on {problems} reach problem{'s' * (problems > 1)}")
 
 
-def test_measured_planning_drops_the_claim_that_planning_is_impossible() -> None:
+def test_measured_planning_removes_the_consequence_for_planning() -> None:
     summary = summary_of(model("adapter", 0.5))
     assert summary.sentence.endswith("ignores the actions, so the model cannot be used for planning.")
     shares = {"adapter": estimate_share(45, 50), "random": estimate_share(0, 50), "oracle": estimate_share(50, 50)}
@@ -364,7 +364,7 @@ def test_measured_planning_drops_the_claim_that_planning_is_impossible() -> None
 @pytest.mark.parametrize(
     ("level", "shuffled", "rank", "distance"), [(2.7, 0.6, 0.02, 1.0), (0.6, 0.9, 0.7, 12.3), (0.6, 4.0, 0.1, 123.4)]
 )
-def test_every_summary_fits_a_screen_and_has_whole_sentences(
+def test_summary_fits_a_screen_and_has_complete_sentences(
     episodes: int, with_base: bool, level: float, shuffled: float, rank: float, distance: float
 ) -> None:
     models = [ranked("base", 1.0, 0.05)] * with_base + [ranked("adapter", level, rank, shuffled=shuffled, noise=0.1)]

@@ -40,7 +40,7 @@ def written(
     return folder
 
 
-def test_errors_against_different_base_models_are_not_put_in_one_column(tmp_path: Path) -> None:
+def test_runs_with_different_base_models_are_compared_with_persistence(tmp_path: Path) -> None:
     folders = [written(tmp_path / name, Oracle(), base=base) for name, base in (("a", Copier()), ("b", Halfway()))]
     found = compare(folders)
     assert any("different base models" in note for note in found.notes)
@@ -50,7 +50,7 @@ def test_errors_against_different_base_models_are_not_put_in_one_column(tmp_path
     assert "base model" in str(same).splitlines()[2]
 
 
-def test_actions_that_were_ranked_differently_do_not_compare(tmp_path: Path) -> None:
+def test_different_action_ranking_settings_give_no_recommendation(tmp_path: Path) -> None:
     more = replace(PROBES, samples=12)
     found = compare([written(tmp_path / "a", Halfway()), written(tmp_path / "b", Halfway(), probes=more)])
     assert any("measured with different settings" in note for note in found.notes)
@@ -59,7 +59,7 @@ def test_actions_that_were_ranked_differently_do_not_compare(tmp_path: Path) -> 
     assert not other_seed.notes
 
 
-def test_runs_are_compared_with_the_first_one_pair_by_pair(tmp_path: Path) -> None:
+def test_gain_over_the_first_run_is_paired_by_clip(tmp_path: Path) -> None:
     found = compare([written(tmp_path / "half", Halfway()), written(tmp_path / "nothing", Copier())])
     rows = {(row.key, row.model): row for row in found.rows}
     assert rows["rollout.l1.over_persistence.4", "half"].value == pytest.approx(0.5, rel=1e-4)
@@ -114,19 +114,19 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
         ((0.40, 0.7, 100), (None, 0.9, 200), "No run is recommended: the action-ranking error of b was not measured."),
     ],
 )
-def test_a_run_is_recommended_as_checkpoints_are_selected(two: Comparison, first, second, expected: str) -> None:
+def test_recommendation_uses_the_rule_of_checkpoint_selection(two: Comparison, first, second, expected: str) -> None:
     assert expected in of_runs(two, a=first, b=second).next_command
 
 
 @pytest.mark.parametrize(
     ("conclusion", "reason"), [("no", "is not better than"), ("inconclusive", "is not known to be better than")]
 )
-def test_no_run_is_recommended_whose_action_ranking_is_not_better(two: Comparison, conclusion, reason: str) -> None:
+def test_run_without_better_action_ranking_is_not_recommended(two: Comparison, conclusion, reason: str) -> None:
     found = of_runs(two, conclusion, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
     assert found.next_command.startswith(f"No run is recommended: the action ranking of b {reason} ")
 
 
-def test_no_run_is_recommended_and_no_difference_claimed_with_too_few_episodes(two: Comparison) -> None:
+def test_too_few_episodes_give_no_recommendation_and_no_difference(two: Comparison) -> None:
     found = of_runs(two, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
     few = "1 held-out episode is too few for a conclusion; at least 5 are needed"
     summaries = {name: one.summary for name, one in found.measured.items()}
@@ -149,7 +149,7 @@ def test_no_run_is_recommended_and_no_difference_claimed_with_too_few_episodes(t
         ((0.04, -0.01, 0.07), "The errors of b and a do not differ significantly."),
     ],
 )
-def test_the_last_sentence_has_gain_interval_and_reference(two: Comparison, gain: tuple, sentence: str) -> None:
+def test_comparison_sentence_has_gain_interval_and_reference(two: Comparison, gain: tuple, sentence: str) -> None:
     found = of_runs(two, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
     value, low, high = gain
     rows = tuple(replace(row, value=value, low=low, high=high) for row in found.rows)
@@ -164,7 +164,7 @@ def test_the_last_sentence_has_gain_interval_and_reference(two: Comparison, gain
         ({"stride": 8}, "stride: 4 and 8"),
     ],
 )
-def test_different_clips_are_not_compared(tmp_path: Path, changes: dict[str, object], words: str) -> None:
+def test_comparing_different_clips_raises(tmp_path: Path, changes: dict[str, object], words: str) -> None:
     one, other = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle(), **changes)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=f"measured on different clips.*{words}"):
         compare([one, other])
@@ -188,7 +188,7 @@ def test_unevaluated_run_raises_with_the_command_that_evaluates_it(tmp_path: Pat
     ("changes", "words"),
     [
         ({"by_clip": {"persistence": 0.5, "models": {}}}, "by_clip.persistence"),
-        ({"rows": [{"key": 1}]}, "metrics that cannot be used"),
+        ({"rows": [{"key": 1}]}, "metrics that cannot be read"),
         ({"format": 99}, "format: Input should be 6"),
     ],
 )
@@ -200,7 +200,7 @@ def test_damaged_metrics_file_raises_with_its_path(tmp_path: Path, changes: dict
         compare([one, other])
 
 
-def test_the_table_has_every_row(tmp_path: Path) -> None:
+def test_comparison_table_has_every_row(tmp_path: Path) -> None:
     found = compare([written(tmp_path / "half_1", Halfway()), written(tmp_path / "100%", Copier())])
     with write_csv(found.rows, tmp_path / "comparison.csv").open(newline="") as file:
         rows = [(row["key"], row["model"], float(row["value"])) for row in csv.DictReader(file)]

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("drawn")
 NAMES = ("runs/lora", "_hidden", r"$\frac$", *(f"run {number}" for number in range(10)))
 
 
-def test_every_run_is_drawn_under_its_own_name_and_style(tmp_path, monkeypatch) -> None:
+def test_each_run_has_its_name_and_a_distinct_line_style(tmp_path, monkeypatch) -> None:
     drawn: list[Figure] = []
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), save(self, *a, **k))[1])
@@ -41,7 +41,7 @@ def test_every_run_is_drawn_under_its_own_name_and_style(tmp_path, monkeypatch) 
     assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == len(NAMES)
 
 
-def test_names_that_look_like_formulas_and_missing_images_do_not_stop_the_image_of_an_evaluation(tmp_path) -> None:
+def test_formula_like_names_and_missing_images_are_plotted(tmp_path) -> None:
     one = evaluation(others=(r"$\frac$",))
     assert plot_evaluation(one, tmp_path / "plot.png").stat().st_size > 1000
     bare = replace(one, examples=tuple(replace(example, frames=None) for example in one.examples))
@@ -54,12 +54,12 @@ def pixels_of(found: PlanResult, folder: Path) -> np.ndarray:
         return np.array(image.convert("RGB"))
 
 
-def test_slices_are_a_row_of_their_own(tmp_path: Path) -> None:
+def test_energy_slices_add_a_row_to_the_plan_plot(tmp_path: Path) -> None:
     heights = [pixels_of(found, tmp_path).shape[0] for found in (asked(), asked(start=100))]
     assert heights == sorted(set(heights), reverse=True)
 
 
-def test_a_plan_without_energies_is_drawn_as_well(tmp_path: Path) -> None:
+def test_plan_without_finite_energies_is_plotted(tmp_path: Path) -> None:
     assert pixels_of(asked(broken=True), tmp_path).std() > 10
 
 

@@ -84,7 +84,7 @@ def images(html: str) -> list[bytes]:
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_the_first_screen_shows_the_summary_of_the_console_and_numbers_that_it_does_not_have(usual: Usual) -> None:
+def test_first_screen_shows_the_console_summary_and_further_numbers(usual: Usual) -> None:
     for one, changes in ((usual[0], {}), (evaluation(episodes=2, clips=8), {"plans": SOLVED})):
         summary = replace(summarize(one, make_rows(one)), **changes)
         first = report_page(one, summary).partition("<details")[0]
@@ -99,7 +99,7 @@ def test_the_first_screen_shows_the_summary_of_the_console_and_numbers_that_it_d
         assert first.count("is better)") + first.count("1: as varied as the true frames; lower: smoother") == len(tiles)
 
 
-def test_a_bar_shows_a_number_its_interval_and_its_baseline_in_their_order() -> None:
+def test_bar_positions_have_the_order_of_their_values() -> None:
     for value, baseline in ((0.3, 0.0), (-0.3, 0.0), (0.3, 0.5), (0.7, 0.5)):
         verdict = Verdict(PLANNING, "yes", "", value, value - 0.04, value + 0.05, baseline=baseline)
         bar = bar_positions(verdict)
@@ -168,7 +168,7 @@ def test_page_is_self_contained_and_deterministic(usual: Usual) -> None:
 
 
 @pytest.mark.usefixtures("drawn")
-def test_the_page_stays_small_whatever_was_measured(usual: Usual, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_stays_below_its_size_limit(usual: Usual, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(usual[1]) < 2_000_000, "with all figures"
     monkeypatch.setattr(write, "figure_to_svg", lambda *_: "")
     rng = np.random.default_rng(0)
@@ -179,7 +179,7 @@ def test_the_page_stays_small_whatever_was_measured(usual: Usual, monkeypatch: p
     assert html.count("data:image/webp") == MAX_CLIPS
 
 
-def test_what_was_not_measured_is_named_with_the_reason() -> None:
+def test_unmeasured_parts_are_listed_with_the_reason() -> None:
     one = evaluation(with_base=False)
     adapter = replace(one.models["adapter"], ranking=None, landscapes=None, distribution=None)
     bare = replace(one, models={"adapter": adapter}, examples=(), copies=None)
@@ -198,7 +198,7 @@ def test_what_was_not_measured_is_named_with_the_reason() -> None:
     assert "No video: vjepa2-ac evaluate runs/kitchen --decoder FOLDER" in shown
 
 
-def test_one_episode_has_no_intervals_and_nothing_is_written_as_nan_even_without_photographs() -> None:
+def test_single_episode_without_images_has_no_intervals_and_no_nan() -> None:
     one = evaluation(episodes=1)
     html = page_of(replace(one, examples=tuple(replace(example, frames=None) for example in one.examples)))
     assert not re.search(r"\bnan\b|\binf\b", re.sub(r"base64,[^\"]*", "", html))

@@ -49,7 +49,7 @@ def test_joint_model_acts_in_joint_space(
     assert "planning.limits.axes: data, but the model has no record" in capsys.readouterr().err
     (tmp_path / "other.yaml").write_text(config.read_text().replace("joint_position", "other"))
     assert main([*given, "--config", str(tmp_path / "other.yaml"), "planning.limits.axes=[0.2]"]) == 2
-    assert "other numbers than the simulated arm measures" in capsys.readouterr().err
+    assert "states that the simulated arm does not measure" in capsys.readouterr().err
 
 
 def test_video_shows_images_and_goal(model: str) -> None:

@@ -88,7 +88,7 @@ def test_named_actions_move_the_hand_in_their_direction(start: Resimulation) -> 
         assert changed[y - 2 : y + 3, x - 2 : x + 3].mean() > changed.mean() + 10
 
 
-def test_the_start_is_the_recorded_one_and_no_outcome_depends_on_another(start: Resimulation) -> None:
+def test_resimulation_starts_at_recorded_state_and_outcomes_are_independent(start: Resimulation) -> None:
     first = start.simulate(make_named_actions("forward", 1), STRIDE)
     start.simulate(make_named_actions("down", 2), STRIDE)
     again = start.simulate(make_named_actions("forward", 1), STRIDE)
@@ -100,7 +100,7 @@ def test_the_start_is_the_recorded_one_and_no_outcome_depends_on_another(start: 
 def test_resimulating_other_data_raises(recorded, droid: Path) -> None:
     ours = episode_of(recorded("A"))
     for episode, step, camera, message in (
-        (episode_of(droid), 0, "exterior_1_left", "not the episode"),
+        (episode_of(droid), 0, "exterior_1_left", "an unknown episode"),
         (ours, STEPS, "exterior_1_left", "Expected 0 to 12"),
         (ours, 0, "front", "one of exterior_1_left"),
     ):

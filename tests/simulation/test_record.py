@@ -36,7 +36,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record_dataset(folder, RecordingSpec("B", STEPS, seed=3), episodes=EPISODES, shards=2)
 
 
-def test_the_loader_reads_what_was_recorded(recorded: Path) -> None:
+def test_recorded_data_set_is_read_by_the_loader(recorded: Path) -> None:
     source = RldsSource(DataConfig(path=str(recorded)))
     infos = source.infos()
     assert [info.num_steps for info in infos] == [STEPS] * EPISODES
@@ -66,7 +66,7 @@ def test_the_same_seed_gives_the_same_bytes_in_any_number_of_processes(
     assert not Path("RAN").exists()
 
 
-def test_one_camera_is_shared_by_all_three_and_three_differ() -> None:
+def test_single_camera_image_is_repeated_and_three_cameras_differ() -> None:
     shared = record_episode(0, RecordingSpec(DOMAIN_A, 2, 0))
     own = record_episode(0, RecordingSpec(DOMAIN_A, 2, 0, cameras=3))
     assert len({tuple(images) for images in shared.images.values()}) == 1
@@ -74,7 +74,7 @@ def test_one_camera_is_shared_by_all_three_and_three_differ() -> None:
     assert own.images["exterior_image_1_left"] == shared.images["exterior_image_1_left"]
 
 
-def test_impossible_numbers_and_unknown_domains_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+def test_invalid_recording_options_raise_and_write_nothing(tmp_path: Path) -> None:
     for spec, episodes, wrong in (
         (RecordingSpec("A"), 0, "at least 1 episode"),
         (RecordingSpec("A", seed=-1), 1, "seed -1"),
@@ -94,7 +94,7 @@ def blocks_of(task: str, seed: int, *, script: bool, steps: int = 41) -> np.ndar
     return np.array(seen)
 
 
-def test_scripts_and_play_move_the_block() -> None:
+def test_scripted_episodes_and_random_play_move_the_block() -> None:
     pushed = blocks_of("push", 1, script=True)
     assert len(pushed) == 41
     assert np.linalg.norm(pushed[-1, :2] - pushed[0, :2]) > 0.08
@@ -108,7 +108,7 @@ def test_scripts_and_play_move_the_block() -> None:
     assert max(ways) > 0.05
 
 
-def test_measurements_follow_commands_that_are_held_for_a_model_step() -> None:
+def test_measured_states_follow_commands_repeated_for_a_model_step() -> None:
     motion = play(arm_for("push", DOMAIN_A), "push", 9, np.random.default_rng(0), script=False)
     for first in (0, 4):
         np.testing.assert_array_equal(motion.commanded_joints[first : first + 4], motion.commanded_joints[[first] * 4])
@@ -142,7 +142,7 @@ def test_read_spec_equals_recorded_spec(tmp_path: Path, spec: RecordingSpec) -> 
 
 def test_folder_without_simulation_file_raises(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"simulation\.json: no such file: .*Expected .*simulate record.*Record it again"
+        InputError, match=r"simulation\.json: no such file; .*Expected .*simulate record.*Record the data set again"
     ):
         read_simulation(tmp_path)
 
@@ -154,7 +154,7 @@ def test_episode_of_another_recording_raises(tmp_path: Path) -> None:
     others = [record_name(RecordingSpec("A", 5), 2), record_name(RecordingSpec("A", 5, seed=1), 1)]
     others += [record_name(RecordingSpec("B", 5), 1), "/nfs/AUTOLab/success/2023-07-07/Fri_Jul__7_09:42:23_2023/x.h5"]
     for other in others:
-        with pytest.raises(InputError, match="not the episode"):
+        with pytest.raises(InputError, match="an unknown episode"):
             simulation.number_of(other)
 
 
@@ -166,8 +166,8 @@ def record_name(spec: RecordingSpec, index: int) -> str:
     ("changes", "message"),
     [
         ({"steps": 0}, "steps: .*greater than or equal to 2"),
-        ({"ranges": {}}, "not one of the keys domain and ranges"),
-        ({"domain": None}, "not one of the keys domain and ranges"),
+        ({"ranges": {}}, "both or neither of the keys domain and ranges"),
+        ({"domain": None}, "both or neither of the keys domain and ranges"),
         ({"task": "stack"}, "task: "),
     ],
 )

@@ -89,7 +89,7 @@ def test_oracle_solves_tasks_and_zero_and_random_actions_do_not(task: TaskName, 
 
 
 @pytest.mark.parametrize("task", ["reach", "push"])
-def test_moving_objects_start_equally_in_every_episode(task: TaskName) -> None:
+def test_moving_objects_have_equal_start_positions_in_every_episode(task: TaskName) -> None:
     options = BenchmarkOptions(task, replace(DOMAIN_B, moving=3), episodes=2, steps=2, films=2)
     arm = arm_for(task, options.world, size=(45, 80))
     zero, random, again = (run_task(options, one, arm) for one in (ZeroActions(), RandomActions(SMALL), ZeroActions()))
@@ -114,7 +114,7 @@ def test_an_episode_starts_at_the_start_and_shows_the_goal(arm: SimulatedArm) ->
         np.testing.assert_array_equal(observation.state, result.states[step])
 
 
-def test_joints_are_observed_moved_and_kept_within_their_limits(arm: SimulatedArm) -> None:
+def test_joint_actions_move_joints_within_their_limits(arm: SimulatedArm) -> None:
     policy = Scripted(0.1 * np.eye(8)[0], 9.0 * np.eye(8)[1])
     result = run_trial(ArmEnvironment(arm), policy, trial_of(1, steps=2, stride=60))
     before, after = (observation.joints for observation in policy.seen)
@@ -126,13 +126,13 @@ def test_joints_are_observed_moved_and_kept_within_their_limits(arm: SimulatedAr
 
 def test_invalid_action_raises(arm: SimulatedArm) -> None:
     for action in (np.zeros(6), np.full(7, np.nan)):
-        with pytest.raises(ValueError, match="no action of 7 or 8 finite numbers"):
+        with pytest.raises(ValueError, match="not an action of 7 or 8 finite numbers"):
             run_trial(ArmEnvironment(arm), Scripted(action), trial_of(1, steps=1))
     with pytest.raises(ValueError, match="none of the simulated arm"):
         Oracle(LIMITS).reset(Trial(0, 1, 1), UNSEEN)
 
 
-def test_a_command_out_of_reach_moves_the_arm_part_of_the_way_and_is_counted(arm: SimulatedArm) -> None:
+def test_unreachable_command_moves_the_arm_partially_and_is_counted(arm: SimulatedArm) -> None:
     script = Scripted(way(0.0, 0.0, 1.6), way(0.0, 0.0, 0.05))
     result = run_trial(ArmEnvironment(arm), script, trial_of(1, steps=2, stride=30))
     risen = result.states[:, 2] - result.states[0, 2]
@@ -172,7 +172,7 @@ def fake(*distances_m: float, unreachable: int = 0) -> EpisodeResult:
     )
 
 
-def test_success_counts_at_the_end_and_passing_is_separate() -> None:
+def test_success_is_measured_at_the_end_and_success_ever_separately() -> None:
     episodes = (fake(0.04, 0.03, 0.2), fake(0.2, 0.1, 0.049), fake(0.01, 0.2, 0.051, unreachable=2))
     result = ClosedLoopResult(BenchmarkOptions().trials(), "x", episodes)
     metrics = result.estimates
@@ -190,7 +190,7 @@ def test_success_counts_at_the_end_and_passing_is_separate() -> None:
     assert replace(result, episodes=late).estimates["steps_needed"].value == 2.5
 
 
-def test_actions_are_shortened_in_their_direction_and_fixed_axes_left_out() -> None:
+def test_long_actions_are_scaled_to_the_limits_without_fixed_axes() -> None:
     limits = LimitsConfig(xyz=(0.05, 0.1, 0.0), rotation=0.2, gripper=0.5)
     cut = shorten_to_limits(np.array([0.1, 0.1, 0.3, 0.1, 0.4, 0.0, -0.8]), limits)
     np.testing.assert_allclose(cut, [0.05, 0.05, 0.0, 0.05, 0.2, 0.0, -0.5], atol=1e-9)
@@ -200,7 +200,7 @@ def test_actions_are_shortened_in_their_direction_and_fixed_axes_left_out() -> N
     assert shorten_to_limits(np.ones(7), LimitsConfig(gripper_mode="held"))[6] == 0.0
 
 
-def test_random_actions_are_those_of_the_trial_within_the_limits_and_over_all_of_them() -> None:
+def test_random_actions_depend_on_the_trial_and_cover_the_limits() -> None:
     policy, draws = RandomActions(LIMITS, seed=4), []
     for index in (0, 1, 0):
         trial = trial_of(index, 1)
@@ -223,7 +223,7 @@ def trial_with_goals(
 
 
 @pytest.mark.parametrize("domain", [DOMAIN_A, DOMAIN_B], ids=["A", "B"])
-def test_the_grasp_is_among_the_goals_of_a_pick(domain: Domain) -> None:
+def test_sub_goals_of_pick_contain_the_grasp(domain: Domain) -> None:
     arm = arm_for("pick", domain, size=(36, 64))
     for index in range(2):
         trial = trial_with_goals("pick", domain, index, seed=4)
@@ -242,16 +242,16 @@ def test_the_grasp_is_among_the_goals_of_a_pick(domain: Domain) -> None:
         assert [goal.at_most for goal in goals] == [*(step + 3 for step in steps[:-1]), None]
 
 
-def test_the_gripper_of_the_oracle_is_free_and_a_task_without_it_has_one_goal() -> None:
+def test_oracle_ignores_gripper_limits_and_reach_has_a_single_goal() -> None:
     for task, names in (("reach", ["end"]), ("push", ["end"]), ("pick", ["before closing", "closed", "end"])):
         arm, trial = arm_for(task, DOMAIN_A, size=(36, 64)), trial_with_goals(task, DOMAIN_A, 1)
         goals = demonstrated_goals(trial, arm, LimitsConfig(gripper_mode="held"))
         assert [goal.name for goal in goals] == names
-    with pytest.raises(InputError, match=r"problem 1 \(pick\): the oracle ends .* after 12 model steps"):
+    with pytest.raises(InputError, match=r"problem 1 \(pick\): the oracle stops .* after 12 model steps"):
         demonstrate(trial, arm, LimitsConfig(xyz=(0.05, 0.05, 0)))
 
 
-def test_every_step_of_a_demonstration_is_a_goal_up_to_where_it_rests() -> None:
+def test_every_step_sub_goals_stop_where_the_demonstration_stops() -> None:
     arm, trial = arm_for("pick", DOMAIN_A, size=(36, 64)), trial_with_goals("pick", DOMAIN_A, 0, seed=4)
     key_goals, goals = (demonstrated_goals(trial, arm, USUAL, way) for way in ("demonstration", "every-step"))
     for goal, frame in zip(goals, demonstrate(trial, arm, USUAL).frames[1:], strict=False):
@@ -261,7 +261,7 @@ def test_every_step_of_a_demonstration_is_a_goal_up_to_where_it_rests() -> None:
     assert [goal.at_most for goal in goals] == [*[2] * (len(goals) - 1), None]
 
 
-def test_a_planner_is_given_the_goals_of_the_trial() -> None:
+def test_planner_follows_the_goals_of_the_trial() -> None:
     planner = controller(horizon=1)
     arm = arm_for("pick", DOMAIN_A)
     goals = demonstrated_goals(trial_with_goals("pick", DOMAIN_A, 0), arm, USUAL, "every-step")

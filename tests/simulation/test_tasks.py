@@ -27,7 +27,7 @@ TASKS = ["reach", "push", "pick", "place"]
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_problem_is_the_same_in_the_world_whatever_the_domain(task: str) -> None:
+def test_problems_in_the_world_frame_do_not_depend_on_the_domain(task: str) -> None:
     turn_a, turn_b = (domain.base_pose()[:3, :3] for domain in (DOMAIN_A, DOMAIN_B))
     for index in range(6):
         one, other = (make_problem(task, domain, 3, index) for domain in (DOMAIN_A, DOMAIN_B))
@@ -78,7 +78,7 @@ def test_place_succeeds_if_block_is_released_on_the_mark() -> None:
     assert not problem.succeeded(open_hand, problem.block_start)
     gap_m = FINGER_INSIDE_M + (1.0 - RELEASED) * FINGER_TRAVEL_M - BLOCK_M / 2
     assert gap_m == pytest.approx(0.004)
-    with pytest.raises(ValueError, match="place is done by a block"):
+    with pytest.raises(ValueError, match="the task place needs the pose of a block"):
         problem.succeeded(open_hand)
 
 

@@ -102,10 +102,10 @@ def test_recording_resumes_and_is_a_valid_data_set(tmp_path: Path) -> None:
         ("nowhere/python world.py", "cannot be started: .*nowhere/python"),
         (f"{sys.executable} 'world.py", "cannot be started: No closing quotation"),
         (command("no expert"), "fake 1.0 Come has no expert"),
-        (command("hard"), "the expert solves 0 of 4 problems in 3 model steps. Expected half of them"),
+        (command("hard"), "the expert solves 0 of 4 problems in 3 model steps. Expected at least half of the problems"),
     ],
 )
-def test_environment_that_cannot_be_used_raises(model: str, world: str, said: str) -> None:
+def test_unusable_environment_raises(model: str, world: str, said: str) -> None:
     subject = load_for_planning(model, overrides=SMALL)
     with pytest.raises(InputError, match=said), ExternalEnvironment(world) as opened:
         run_world_benchmark(subject, opened, BenchmarkOptions(episodes=2, films=0))
@@ -214,16 +214,16 @@ def test_environment_timeout_raises_with_last_error_output(program: Program, wri
 
 @pytest.mark.usefixtures("short_wait")
 def test_environment_with_closed_output_raises(program: Program) -> None:
-    assert "it has closed its output" in fail(program("os.close(1); time.sleep(1000)"), 0.1)
+    assert "the program closed its output" in fail(program("os.close(1); time.sleep(1000)"), 0.1)
 
 
 def test_endless_line_raises_at_size_limit(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worlds, "_MOST_BYTES", 1 << 20)
+    monkeypatch.setattr(worlds, "_MAX_LINE_BYTES", 1 << 20)
     assert "a line of more than 1 MiB" in fail(program("while True: sys.stdout.write('x' * 65536)"))
 
 
 @pytest.mark.usefixtures("short_wait")
-def test_environment_that_does_not_read_requests_raises(program: Program) -> None:
+def test_environment_with_unread_requests_raises(program: Program) -> None:
     with EnvironmentProcess(program(first=f"{HELLO}time.sleep(1000)"), 0.01) as world:
         world.exchange()
         errors = []
@@ -232,23 +232,23 @@ def test_environment_that_does_not_read_requests_raises(program: Program) -> Non
                 world.exchange({"do": "x" * 3900})
             errors.append(str(error.value))
     assert "no answer within 0.01 s" in errors[0]
-    assert "it does not read its requests" in errors[-1]
+    assert "the program does not read its requests" in errors[-1]
 
 
 @pytest.mark.parametrize(
     ("first", "request_code", "found"),
     [
         (HELLO, "print(json.dumps(answer) + chr(10) + json.dumps(answer), flush=True)", "after its answer"),
-        (HELLO, "print('[' * 100_000, flush=True)", "it wrote '\\[\\["),
+        (HELLO, "print('[' * 100_000, flush=True)", "the program wrote '\\[\\["),
         (HELLO, "print('[1]', flush=True)", "\\[1\\]"),
         (
             HELLO,
             "raise RuntimeError('the cube fell off')",
-            "ended with status 1\n(.*\n)*RuntimeError: the cube fell off",
+            "exited with status 1\n(.*\n)*RuntimeError: the cube fell off",
         ),
         (HELLO, "print(json.dumps({'error': 'the arm is asleep'}), flush=True)", "the arm is asleep"),
         (HELLO, "say(state=answer['state'][:6])", "state: 6 numbers with shape \\(6,\\). Expected 7: x"),
-        ("print('Welcome!', flush=True)", "say()", "wrote 'Welcome!'. Expected a JSON object"),
+        ("print('Welcome!', flush=True)", "say()", "wrote 'Welcome!'. Expected one JSON object"),
         ("print(json.dumps(about | {'rate_hz': 0}), flush=True)", "say()", "rate_hz: "),
         (HELLO, "say(distance_m=float('nan'))", "distance_m nan"),
         (HELLO, "say(success='yes')", "success 'yes'"),
@@ -256,13 +256,15 @@ def test_environment_that_does_not_read_requests_raises(program: Program) -> Non
         (HELLO, "say(target=[float('nan')] * 7)", "target: .* Expected finite numbers"),
         (HELLO, "say(state=[10**400] * 7)", "int too large"),
         (HELLO, "say(image=image | {'height': -1})", "an image of -1x3 pixels"),
-        (HELLO, "say(image=image | {'height': 3, 'width': 2} if number else image)", "\\(3, 2, 3\\) after others of"),
+        (
+            HELLO,
+            "say(image=image | {'height': 3, 'width': 2} if number else image)",
+            "\\(3, 2, 3\\) after images with shape",
+        ),
         ("print(json.dumps(about | {'task': 'x' * 300}), flush=True)", "say()", "task: "),
     ],
 )
-def test_a_wrong_answer_is_one_error_that_names_the_command(
-    program: Program, first: str, request_code: str, found: str
-) -> None:
+def test_invalid_answer_raises_with_the_command(program: Program, first: str, request_code: str, found: str) -> None:
     assert re.search(found, fail(program(request_code, first=first)))
 
 
@@ -278,7 +280,7 @@ def test_unrequested_answer_raises(program: Program, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("task", ["../../../out", "/out", "a\0b\nc\x1b[2J", ".."])
-def test_no_task_leaves_the_folder_of_its_recordings(program: Program, tmp_path: Path, task: str) -> None:
+def test_task_name_with_separators_stays_in_the_recording_folder(program: Program, tmp_path: Path, task: str) -> None:
     folder = tmp_path / "a" / "b" / "set"
     with ExternalEnvironment(program(first=f"about['task'] = {task!r}\n{HELLO}")) as world:
         record_world(world, folder, range(1))
@@ -288,7 +290,7 @@ def test_no_task_leaves_the_folder_of_its_recordings(program: Program, tmp_path:
     assert file.name.isprintable()
 
 
-def test_an_error_output_of_any_length_takes_little_memory_and_its_end_is_shown(program: Program) -> None:
+def test_long_error_output_is_truncated_to_its_last_lines(program: Program) -> None:
     flood = "for _ in range(128): sys.stderr.write('e' * 65536)"
     tracemalloc.start()
     try:
@@ -296,7 +298,7 @@ def test_an_error_output_of_any_length_takes_little_memory_and_its_end_is_shown(
         assert tracemalloc.get_traced_memory()[1] < 2 << 20
     finally:
         tracemalloc.stop()
-    assert "it has ended with status 1\n" in message
+    assert "the program exited with status 1\n" in message
     assert "out of luck\n" in message
 
 

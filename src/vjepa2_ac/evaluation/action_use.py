@@ -212,8 +212,10 @@ def rank_actions(
     def ranked(move: RolloutStart) -> tuple[float, ...]:
         drawn = draw_alternatives(move.true, largest, space, probes, move.generator(seed))
         evaluated = np.concatenate([move.true[None], drawn])
-        (true, *others), (_, *changes) = evaluate_actions(model, move, evaluated, at_once=probes.at_once)
-        energies = np.reshape(others, (2, -1))
+        (true, *energies_of_alternatives), (_, *changes) = evaluate_actions(
+            model, move, evaluated, at_once=probes.at_once
+        )
+        energies = np.reshape(energies_of_alternatives, (2, -1))
         is_same = np.abs(energies - true) <= SAME_ENERGY * max(abs(true), 1e-12)
         # A prediction that is not finite counts as the farthest: all alternatives are closer than such a true action.
         is_closer = energies < true if np.isfinite(true) else np.ones_like(energies)

@@ -65,13 +65,13 @@ class LatentSums:
     @classmethod
     def joined(cls, parts: Sequence[LatentSums]) -> LatentSums:
         """Return the sums over the clips of all parts, which must have the same origin."""
-        whole = cls()
+        joined = cls()
         for part in parts:
-            whole.episode_ids += part.episode_ids
-            whole._pooled += part._pooled
-            whole._total = whole._total + part._total
-            whole._squares = whole._squares + part._squares
-        return whole
+            joined.episode_ids += part.episode_ids
+            joined._pooled += part._pooled
+            joined._total = joined._total + part._total
+            joined._squares = joined._squares + part._squares
+        return joined
 
     @property
     def pooled(self) -> Float[np.ndarray, "clips horizon dim"]:
@@ -96,14 +96,14 @@ def compare_distributions(predicted: LatentSums, true: LatentSums) -> LatentDist
     pairs = zip(predicted.pooled.swapaxes(0, 1), true.pooled.swapaxes(0, 1), strict=True)
     return LatentDistribution(
         spread=relative_spread(predicted, true),
-        mmd=tuple(mmd(one, other, true.episode_ids) for one, other in pairs),
+        mmd=tuple(mmd(predicted, latents, true.episode_ids) for predicted, latents in pairs),
         fvd=frechet_distance(predicted.features, true.features),
         variance=tuple(predicted.variances().tolist()),
         true_variance=tuple(true.variances().tolist()),
     )
 
 
-def frechet_distance(one: Float[np.ndarray, "clips dim"], other: Float[np.ndarray, "others dim"]) -> float:
+def frechet_distance(first: Float[np.ndarray, "clips dim"], second: Float[np.ndarray, "other_clips dim"]) -> float:
     """Return |mean - mean'|^2 + tr C + tr C' - 2 tr (C C')^(1/2) of two sets of features; NaN for a single clip.
 
     With fewer clips than dimensions the covariances are singular. The last trace is exact in this case, too: with
@@ -112,11 +112,11 @@ def frechet_distance(one: Float[np.ndarray, "clips dim"], other: Float[np.ndarra
     Source: Dowson and Landau (1982), The Fréchet distance between multivariate normal distributions; as a metric of
     videos, Unterthiner et al. (2018), FVD.
     """
-    if min(len(one), len(other)) < 2:
+    if min(len(first), len(second)) < 2:
         return math.nan
-    means = one.mean(axis=0), other.mean(axis=0)
+    means = first.mean(axis=0), second.mean(axis=0)
     left, right = (
-        (values - mean) / math.sqrt(len(values) - 1) for values, mean in zip((one, other), means, strict=True)
+        (values - mean) / math.sqrt(len(values) - 1) for values, mean in zip((first, second), means, strict=True)
     )
     common = np.linalg.svd(left @ right.T, compute_uv=False).sum()
     return float(np.square(means[0] - means[1]).sum() + np.square(left).sum() + np.square(right).sum() - 2 * common)
@@ -149,9 +149,9 @@ def mmd(
     Source: Gretton et al. (2012), A Kernel Two-Sample Test, lemma 6, with pairs of one episode left out as pairs of one
     sample are there; the kernel: Luo et al. (2410.05203), JEDi.
     """
-    one, other = predicted.astype(np.float64), true.astype(np.float64)
-    across = _kernel(one, other)
-    pairs = _summed(_kernel(one, one) + _kernel(other, other) - across - across.T, episode_ids)
+    predicted, true = predicted.astype(np.float64), true.astype(np.float64)
+    across = _kernel(predicted, true)
+    pairs = _summed(_kernel(predicted, predicted) + _kernel(true, true) - across - across.T, episode_ids)
     counts = _summed(np.ones((len(episode_ids), len(episode_ids))), episode_ids)
 
     def of_weights(weights: np.ndarray) -> np.ndarray:
@@ -171,9 +171,9 @@ def _summed(
 
 
 def _kernel(
-    one: Float[np.ndarray, "clips dim"], other: Float[np.ndarray, "others dim"]
-) -> Float[np.ndarray, "clips others"]:
-    return np.asarray((one @ other.T / one.shape[1]) ** 2)
+    first: Float[np.ndarray, "clips dim"], second: Float[np.ndarray, "other_clips dim"]
+) -> Float[np.ndarray, "clips other_clips"]:
+    return np.asarray((first @ second.T / first.shape[1]) ** 2)
 
 
 def _quadratic(

@@ -165,8 +165,8 @@ def _collect(
         origins := gather_shared([batch.latents[:, 1:].float().flatten(2).mean(dim=0).cpu() for batch, _ in first])
     ):
         raise no_readable_clips()
-    predicted = {one.name: LatentSums(origins[0]) for one in evaluated_models}
-    errors: dict[str, list[PredictionErrors]] = {one.name: [] for one in evaluated_models}
+    predicted = {model.name: LatentSums(origins[0]) for model in evaluated_models}
+    errors: dict[str, list[PredictionErrors]] = {model.name: [] for model in evaluated_models}
     true, copies = LatentSums(origins[0]), LatentSums(origins[0])
     actions, names = list[np.ndarray](), list[ClipName]()
     starts, moves = list[RolloutStart](), list[RolloutStart]()

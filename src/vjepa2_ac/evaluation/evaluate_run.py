@@ -90,8 +90,8 @@ def load_models(
     evaluated_models: list[EvaluatedModel] = []
     if BASE in against and config.model.is_random:
         if options.against is not None:
-            found, needed = "a model without a base model (model.base: random)", "a base model"
-            raise InputError(where="--against base", found=found, needed=needed, fix="Leave out --against base")
+            problem, needed = "a model without a base model (model.base: random)", "a base model"
+            raise InputError(where="--against base", found=problem, needed=needed, fix="Leave out --against base")
     elif BASE in against and not is_of_run:
         base_model = _load_like(name, world_model, config.model.base, config, dataset.widths)
         evaluated_models.append(EvaluatedModel(BASE, "base", base_model))
@@ -131,12 +131,12 @@ def _load_like(subject: str, world_model: WorldModel, other: str, config: Config
     loaded = load_subject(other, config=None if is_run(other) else config).world_model
     same = loaded.image_size == world_model.image_size
     if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():
-        found, needed = (
+        problem, needed = (
             f"an encoder that differs from that of {subject}",
             "the same encoder, since errors compare latents",
         )
         fix = "Evaluate each run separately, and compare their errors relative to persistence with `vjepa2-ac compare`"
-        raise InputError(where=where, found=found, needed=needed, fix=fix)
+        raise InputError(where=where, found=problem, needed=needed, fix=fix)
     require_widths(loaded, widths, where=where)
     return loaded
 

@@ -73,7 +73,7 @@ class ImagineOptions:
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, split
 
 
-def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservation) -> RolloutComparison:
+def imagine_image(session: Subject, options: ImagineOptions, observation: ImageObservation) -> RolloutComparison:
     """Predict and decode the frames after an image, for actions by name or from files.
 
     With `planning.views` above 1 the image contains the views of several cameras, as for a planner.
@@ -81,7 +81,7 @@ def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservat
     Args:
         session: The model, and the config with the crop and the limits.
         options: Decoder, actions (names of directions, or files), number of steps, and their size.
-        seen: The image and the state before the first action.
+        observation: The image and the state before the first action.
 
     Raises:
         InputError: Decoder, state or actions cannot be used.
@@ -91,16 +91,20 @@ def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservat
     decoder = load_decoder(options.decoder)
     warnings = decoder.require_fit(model, config.data, subject=session.name)
     decoder.to(model.device)
-    space = get_state_space(config.data, len(seen.state))
+    space = get_state_space(config.data, len(observation.state))
     _require_directions(space, where="--state")
     limits = config.planning.limits
     chosen = {name: _actions_by_name(name, options.steps, options.size_m, limits) for name in options.actions}
-    camera = None if seen.extrinsics is None else torch.as_tensor(seen.extrinsics, dtype=torch.float32).to(model.device)
+    camera = (
+        None
+        if observation.extrinsics is None
+        else torch.as_tensor(observation.extrinsics, dtype=torch.float32).to(model.device)
+    )
     views = config.planning.views
-    latents = encode_frames(model, seen.image[None], config.data.crop, views=views)
-    state = np.asarray(seen.state, dtype=np.float64)
+    latents = encode_frames(model, observation.image[None], config.data.crop, views=views)
+    state = np.asarray(observation.state, dtype=np.float64)
     starts = [Start(view_latents, state, space, camera) for view_latents in latents[0].chunk(views)]
-    cut = crop_frames(split_views(seen.image[None], views), config.data.crop)
+    cut = crop_frames(split_views(observation.image[None], views), config.data.crop)
     first = np.concatenate(to_display_frames(cut, model.image_size), axis=1)
     decoded_first = decode_views(decoder.decoder, latents, views)[0]
 
@@ -129,11 +133,11 @@ def imagine_image(session: Subject, options: ImagineOptions, seen: ImageObservat
 def _require_directions(space: StateSpace, *, where: str, fix: str = "") -> None:
     """Check that named actions are defined: not for vectors, and not for poses in the camera frame."""
     if not space.is_base_pose:
-        found, needed = (
+        problem, needed = (
             "states that are not poses in the robot base frame",
             "poses, because names are directions in that frame",
         )
-        raise InputError(where=where, found=found, needed=needed, fix=fix)
+        raise InputError(where=where, found=problem, needed=needed, fix=fix)
 
 
 def _actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig) -> Float[np.ndarray, "steps 7"]:
@@ -178,7 +182,7 @@ def imagine_clip(
     try:
         if simulate is not None and (outcome := simulate(dataset, *window)) is not None:
             for name in chosen.keys() - truths:
-                truths[name] = _as_seen(*outcome(chosen[name]), config=config, size=size)
+                truths[name] = _crop_and_resize(*outcome(chosen[name]), config=config, size=size)
     except UserError as error:
         notes = (f"The true outcome of other actions was not simulated: {error}",)
     rollouts: list[DecodedRollout] = []
@@ -231,16 +235,16 @@ def _window(dataset: Dataset, options: ImagineOptions) -> tuple[int, int]:
         longest = int(lengths[dataset.episodes[members]].max(initial=0))
         if 0 < longest < clip:
             most = (longest - 1) // dataset.config.model_stride
-            found = f"{counted(options.steps, 'model step')}, and the longest {split} episode has {most}"
-            raise InputError(where="--steps", found=found, needed=f"at most {most}")
+            problem = f"{counted(options.steps, 'model step')}, and the longest {split} episode has {most}"
+            raise InputError(where="--steps", found=problem, needed=f"at most {most}")
         windows = validation_windows(dataset, split, clips=_SEARCHED)
         return max(windows, key=lambda window: _motion(dataset, *window))
     episode = find_episode(dataset, options.episode)
     start, last = options.start or 0, int(lengths[episode]) - clip
     if not 0 <= start <= last:
         needed = f"0 to {last}: a clip takes {counted(clip, 'control step')}" if last >= 0 else "a longer episode"
-        found, fix = f"{start}, in an episode of {counted(lengths[episode], 'step')}", "Lower --steps or --start"
-        raise InputError(where="--start", found=found, needed=needed, fix=fix)
+        problem, fix = f"{start}, in an episode of {counted(lengths[episode], 'step')}", "Lower --steps or --start"
+        raise InputError(where="--start", found=problem, needed=needed, fix=fix)
     return episode, start
 
 
@@ -251,7 +255,7 @@ def _motion(dataset: Dataset, episode: int, start: int) -> float:
     return dataset.spaces.state.compute_path_length(states)
 
 
-def _as_seen(
+def _crop_and_resize(
     frames: Frames, arm: Bool[np.ndarray, "time h w"], *, config: Config, size: int
 ) -> tuple[Frames, Bool[np.ndarray, "time size size"]]:
     """Return the frames after the first one, and the arm's silhouettes in all frames, cropped and resized as inputs."""

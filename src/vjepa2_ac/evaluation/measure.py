@@ -140,20 +140,20 @@ def prediction_errors(
 
 
 def previous_clip_actions(
-    own: range, windows: Sequence[_Window], read: Callable[[list[_Window]], Iterator[Batch]]
+    indices: range, windows: Sequence[_Window], read: Callable[[list[_Window]], Iterator[Batch]]
 ) -> Float[Tensor, "1 time action_dim"] | None:
     """Return the actions of the clip before this process's first clip, which are the first clip's shuffled actions.
 
     None: this process has the first clip of all, or no clips.
 
     Args:
-        own: The indices of this process's clips.
+        indices: The indices of this process's clips.
         windows: The windows of all clips.
         read: Reads the clips of windows; broken clips are left out.
     """
-    if len(own) in (0, len(windows)):
+    if len(indices) in (0, len(windows)):
         return None
-    before = (batch.actions for window in reversed(windows[: own.start]) for batch in read([window]))
+    before = (batch.actions for window in reversed(windows[: indices.start]) for batch in read([window]))
     if (nearest := next(before, None)) is not None:
         return nearest
     # No clip before this part can be read: use the second readable clip, as a single process does for its first clip.

@@ -101,7 +101,7 @@ def _config_of(subject: str, options: EvaluationOptions) -> Config:
             )
         return run_config
     if options.out is None:
-        found, needed = "no output folder", "--out: metrics.json in a run's folder belongs to the run's own data"
-        raise InputError(where="--data without --out", found=found, needed=needed, fix="Add --out FOLDER")
+        problem, needed = "no output folder", "--out: metrics.json in a run's folder belongs to the run's own data"
+        raise InputError(where="--data without --out", found=problem, needed=needed, fix="Add --out FOLDER")
     require_stride(options.data.data, to="evaluate")
     return options.data if run_config is None else run_config.model_copy(update={"data": options.data.data})

@@ -354,9 +354,11 @@ def one_step_over_persistence(
     )
 
 
-def gain_over(errors: PredictionErrors, others: PredictionErrors, mode: Mode = "rollout", metric: Metric = L1) -> Curve:
+def gain_over(
+    errors: PredictionErrors, reference: PredictionErrors, mode: Mode = "rollout", metric: Metric = L1
+) -> Curve:
     """Return the relative gain over another model at each horizon, paired by clip: 0.18 is 18 % better."""
-    pair = [each.of(mode, metric) for each in (errors, others)]
+    pair = [each.of(mode, metric) for each in (errors, reference)]
     better = 1 if metric.smaller_is_better else -1
     return bootstrap(lambda sums: better * (1 - sums[0] / sums[1]), np.stack(pair), errors.episode_ids)
 
@@ -373,9 +375,9 @@ def gap_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
     return estimate_ratio((changed - true).mean(axis=1), _one_step(errors, "persistence"), errors.episode_ids)
 
 
-def rank_difference(one: ActionRanking, other: ActionRanking) -> Estimate:
+def rank_difference(ranking: ActionRanking, reference: ActionRanking) -> Estimate:
     """Return the action-ranking error minus that of another model on the same moves, paired: below 0 is better."""
-    return estimate_mean(one.ranks - other.ranks, one.episode_ids)
+    return estimate_mean(ranking.ranks - reference.ranks, ranking.episode_ids)
 
 
 def _one_step(errors: PredictionErrors, actions: ActionMode, steps: Steps | None = None) -> np.ndarray:

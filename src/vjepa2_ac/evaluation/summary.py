@@ -223,8 +223,8 @@ def _without_conclusion(verdict: Verdict) -> Verdict:
     return replace(verdict, conclusion=conclusion, low=None, high=None)
 
 
-def _are_too_few(number: int, what: str) -> str:
-    return f"{counted(number, what)} {'is' if number == 1 else 'are'} {_TOO_FEW}"
+def _are_too_few(number: int, noun: str) -> str:
+    return f"{counted(number, noun)} {'is' if number == 1 else 'are'} {_TOO_FEW}"
 
 
 def not_measured_verdict(name: str, how: str) -> Verdict:
@@ -405,10 +405,12 @@ def closed_loop_verdict(
         needs = f"{solved}, so they cannot be used for comparison; raise --steps."
     elif problems < MIN_EPISODES:
         needs = f"{_are_too_few(problems, 'problem')}; use --episodes 50."
-    others = ", ".join(f"{name} {format_percent(rate.value)} %" for name, rate in shares.items() if name != model)
+    competitors_text = ", ".join(
+        f"{name} {format_percent(rate.value)} %" for name, rate in shares.items() if name != model
+    )
     statement = (
         f"success rate {format_percent(share.value)} % on {counted(problems, f'{task} problem')} {conditions}".rstrip()
     )
     competitors = "the zero action and random actions"
     verdict = _verdict(PLANNING, "inconclusive" if needs else conclusion, statement, share, competitors)
-    return replace(verdict, reference=f"({others})", needs=needs, baseline=best.value)
+    return replace(verdict, reference=f"({competitors_text})", needs=needs, baseline=best.value)

@@ -49,11 +49,11 @@ class Comparison:
         has_base = _have_same_base(self.measured.values())
         reference = "base model" if has_base else "persistence"
         lines = [_LINE.format(*head).rstrip() for head in (_HEAD, ("run", "checkpoint", reference, *_COLUMNS), _BETTER)]
-        for name, one in self.measured.items():
-            gain, step = one.of(key), _step(one)
+        for name, metrics in self.measured.items():
+            gain, step = metrics.of(key), _step(metrics)
             error = self.curves[name][-1].value - 1 if not has_base else -gain.value if gain else 0.0
-            checkpoint = "base model" if one.about.is_base else "none" if step is None else f"{step:,}"
-            used, rank = _number(one.summary.uses_actions), _number(one.summary.ranks_actions)
+            checkpoint = "base model" if metrics.about.is_base else "none" if step is None else f"{step:,}"
+            used, rank = _number(metrics.summary.uses_actions), _number(metrics.summary.ranks_actions)
             numbers = (_shown(error, "+.1f"), _shown(used, "+.1f"), _shown(rank, ".1f"))
             lines.append(_LINE.format(name if len(name) <= 22 else f"…{name[-21:]}", checkpoint, *numbers))
         title = f"{len(self.measured)} runs on the same {first.summary.measured}, {self.seconds[-1]:.1f} s ahead"
@@ -68,7 +68,7 @@ class Comparison:
             return f"Whether the errors differ is not measured: {self._too_few}"
         if not (side := gains[best].compare_to(0.0)):
             return f"The errors of {best} and {first} do not differ significantly."
-        low, value, high = (format_percent(one) for one in sorted(map(abs, astuple(gains[best]))))
+        low, value, high = (format_percent(end) for end in sorted(map(abs, astuple(gains[best]))))
         change = f"{value} % {'lower' if side > 0 else 'higher'}"
         interval = f"95 % CI {low} to {high} %, n = {counted(measured.clips.episodes, 'episode')}"
         return f"The error of {best} is {change} than that of {first} ({interval})."
@@ -80,10 +80,10 @@ class Comparison:
         The rule is that of `checkpoint.keep_best`: the lowest action-ranking error; among runs within
         `RANKING_TOLERANCE` of it, the lowest prediction error.
         """
-        ranks = {name: _number(one.summary.ranks_actions) for name, one in self.measured.items()}
+        ranks = {name: _number(metrics.summary.ranks_actions) for name, metrics in self.measured.items()}
         equal = [name for name, rank in ranks.items() if rank <= min(ranks.values()) + RANKING_TOLERANCE]
         best = min(equal, key=lambda name: self.curves[name][-1].value, default="")
-        if len({one.ranked for one in self.measured.values()}) > 1:
+        if len({metrics.ranked for metrics in self.measured.values()}) > 1:
             return "No run is recommended: the actions were ranked with different settings."
         if missing := [name for name, rank in ranks.items() if math.isnan(rank)]:
             why = f"the action-ranking error of {', '.join(missing)} was not measured."
@@ -134,9 +134,9 @@ def compare(folders: Sequence[Path]) -> Comparison:
     about, clips = first.about, first.clips
     rows = [
         replace(row, model=name, detail=row.detail and not row.key.startswith(f"rollout.{L1.name}.gain_over_base"))
-        for name, one in measured.items()
-        for row in one.rows
-        if row.model == one.trained
+        for name, metrics in measured.items()
+        for row in metrics.rows
+        if row.model == metrics.trained
     ]
     return Comparison(
         title=f"{L1.label} error over persistence on {counted(clips.count, about.split + ' clip')}"
@@ -150,16 +150,16 @@ def compare(folders: Sequence[Path]) -> Comparison:
     )
 
 
-def _check_same_clips(one: Metrics, other: Metrics, first: Path, second: Path) -> None:
-    pairs = {key: (getattr(one.about, key), getattr(other.about, key)) for key in _SAME}
-    pairs["clips"] = one.clips.count, other.clips.count
-    differences = [f"{what}: {a} and {b}" for what, (a, b) in pairs.items() if a != b]
-    if not differences and one.clips.fingerprint != other.clips.fingerprint:
-        differences = [f"different episodes or start steps, from {one.about.data} and {other.about.data}"]
+def _check_same_clips(first: Metrics, second: Metrics, first_folder: Path, second_folder: Path) -> None:
+    pairs = {key: (getattr(first.about, key), getattr(second.about, key)) for key in _SAME}
+    pairs["clips"] = first.clips.count, second.clips.count
+    differences = [f"{name}: {a} and {b}" for name, (a, b) in pairs.items() if a != b]
+    if not differences and first.clips.fingerprint != second.clips.fingerprint:
+        differences = [f"different episodes or start steps, from {first.about.data} and {second.about.data}"]
     if differences:
         fix = "Evaluate them again with the same --data, --split and --clips"
-        found = f"measured on different clips ({'; '.join(differences)})"
-        raise InputError(where=f"{first} and {second}", found=found, fix=fix)
+        problem = f"measured on different clips ({'; '.join(differences)})"
+        raise InputError(where=f"{first_folder} and {second_folder}", found=problem, fix=fix)
 
 
 def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
@@ -167,10 +167,10 @@ def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
 
     The errors are first divided by those of persistence.
     """
-    (name, first), *others = measured.items()
+    (name, first), *later_runs = measured.items()
     ids = [episode for episode, _ in first.clips.named]
     rows = []
-    for other, metrics in others:
+    for run, metrics in later_runs:
         columns = np.stack([*_last(metrics), *_last(first)])[:, :, None]
         (gain,) = bootstrap(lambda sums: 1 - (sums[0] / sums[1]) / (sums[2] / sums[3]), columns, ids)
         group, line = (
@@ -178,7 +178,7 @@ def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
             f"{(first.about.frames - 1) * first.about.seconds_per_step:.2f} s ahead",
         )
         numbers = (gain.value, gain.low, gain.high)
-        rows.append(Row(group, line, "gain_over_first", other, *numbers, form=".1%", better="higher", chance=0.0))
+        rows.append(Row(group, line, "gain_over_first", run, *numbers, form=".1%", better="higher", chance=0.0))
     return rows
 
 
@@ -209,34 +209,36 @@ def _curve(metrics: Metrics) -> tuple[Estimate, ...]:
 def _have_same_base(measured: Iterable[Metrics]) -> bool:
     """Return whether all runs were compared with the same base model, recognised by equal errors."""
     errors = []
-    for one in measured:
-        if one.base is None and not one.about.is_base:
+    for metrics in measured:
+        if metrics.base is None and not metrics.about.is_base:
             return False
-        errors.append(float(np.mean(one.by_clip.models[one.base or one.trained])))
+        errors.append(float(np.mean(metrics.by_clip.models[metrics.base or metrics.trained])))
     return max(errors) - min(errors) <= _SAME_LATENTS * abs(errors[0])
 
 
 def _notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
-    persistence = {name: _last(one)[1].mean() for name, one in measured.items()}
+    persistence = {name: _last(metrics)[1].mean() for name, metrics in measured.items()}
     first, *names = measured
-    others = [name for name in names if abs(persistence[name] / persistence[first] - 1) > _SAME_LATENTS]
+    different = [name for name in names if abs(persistence[name] / persistence[first] - 1) > _SAME_LATENTS]
     notes = []
-    if others:
+    if different:
         notes.append(
-            f"The latents of {', '.join(others)} differ from those of {first} (another encoder or crop):"
+            f"The latents of {', '.join(different)} differ from those of {first} (another encoder or crop):"
             " only errors relative to persistence can be compared."
         )
-    selections = {name: selection_reason(one.about.checkpoint) for name, one in measured.items()}
+    selections = {name: selection_reason(metrics.about.checkpoint) for name, metrics in measured.items()}
     if len(set(selections.values())) > 1:
         notes.append(
             f"The checkpoints were selected differently: "
             f"{', '.join(f'{selection} ({name})' for name, selection in selections.items())}."
         )
-    if len({one.ranked for one in measured.values() if one.ranked is not None}) > 1:
-        settings = "; ".join(f"{name}: {one.ranked}" for name, one in measured.items())
+    if len({metrics.ranked for metrics in measured.values() if metrics.ranked is not None}) > 1:
+        settings = "; ".join(f"{name}: {metrics.ranked}" for name, metrics in measured.items())
         notes.append(
             f"The action-ranking errors cannot be compared: they were measured with different settings ({settings})."
         )
-    if not _have_same_base(measured.values()) and all(one.base or one.about.is_base for one in measured.values()):
+    if not _have_same_base(measured.values()) and all(
+        metrics.base or metrics.about.is_base for metrics in measured.values()
+    ):
         notes.append("The runs have different base models. Errors are therefore relative to persistence.")
     return tuple(notes)

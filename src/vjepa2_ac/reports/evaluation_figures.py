@@ -42,7 +42,7 @@ from vjepa2_ac.reports.comparison import Comparison
 _COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE}
 _RUNS = (BLUE, ORANGE, GREEN, "#8f5bb0", RED, "#0b7f8a", "#8a6d0b", "#333333")
 _DASHES = ("-", "--", ":")  # the next line style is used after all colours
-_OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
+_FURTHER_COLOURS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
 _PERSISTENCE = "persistence (copy the last frame)"
 _GREY_PX = 224  # side of the grey image that is shown if a cache has no frames
 
@@ -129,36 +129,44 @@ def draw_sensitivity(figure: Any, evaluation: Evaluation) -> None:
 def _draw_landscapes(figure: Any, evaluation: Evaluation) -> None:
     """Draw slices of the energy through the true action: of the base and the evaluated model, of three clips."""
     models = {name: model.landscapes for name, model in evaluation.models.items()}
-    drawn = {name: one for name, one in models.items() if one and name in {evaluation.base, evaluation.trained}}
-    places = _landscape_clips(evaluation)
-    grid = figure.subplots(len(places) * len(drawn), 3, squeeze=False)
-    for row, (place, (name, found)) in zip(grid, itertools.product(places, drawn.items()), strict=True):
+    drawn = {
+        name: landscapes
+        for name, landscapes in models.items()
+        if landscapes and name in {evaluation.base, evaluation.trained}
+    }
+    clips = _landscape_clips(evaluation)
+    grid = figure.subplots(len(clips) * len(drawn), 3, squeeze=False)
+    for row, (clip, (name, landscapes)) in zip(grid, itertools.product(clips, drawn.items()), strict=True):
         for axes, (first, second) in zip(row, itertools.combinations(range(3), 2), strict=True):
-            mesh = _plane(axes, found, place, first, second)
+            mesh = _plane(axes, landscapes, clip, first, second)
         figure.colorbar(mesh, ax=list(row), label="energy (L1)")
-        row[0].set_title(f"{_short(name)}, clip {place + 1}", loc="left")
+        row[0].set_title(f"{_short(name)}, clip {clip + 1}", loc="left")
 
 
 def _landscape_clips(evaluation: Evaluation) -> list[int]:
     """Return the clips whose landscapes are shown: of the nearest, the median and the farthest minimum."""
-    found = evaluation.models[evaluation.trained].landscapes
-    if found is None:
+    landscapes = evaluation.models[evaluation.trained].landscapes
+    if landscapes is None:
         return []
-    order = sorted(range(len(found.maps)), key=lambda place: found.maps[place].distance)
+    order = sorted(range(len(landscapes.maps)), key=lambda clip: landscapes.maps[clip].distance)
     return sorted({0: order[0], 1: order[len(order) // 2], 2: order[-1]}.values())
 
 
-def _plane(axes: Any, landscapes: Landscapes, place: int, first: int, second: int) -> Any:
+def _plane(axes: Any, landscapes: Landscapes, clip: int, first: int, second: int) -> Any:
     """Draw the energy over two components of the action; return the mesh for a colour bar."""
-    one = landscapes.maps[place]
+    landscape = landscapes.maps[clip]
     third = ({0, 1, 2} - {first, second}).pop()
-    energy = np.take(one.energy, int(np.abs(one.axes[third] - one.true[third]).argmin()), axis=third)
-    limits = {"vmin": float(one.energy.min()), "vmax": float(one.energy.max())}
-    mesh = axes.pcolormesh(one.axes[first], one.axes[second], energy.T, shading="gouraud", rasterized=True, **limits)
+    energy = np.take(landscape.energy, int(np.abs(landscape.axes[third] - landscape.true[third]).argmin()), axis=third)
+    limits = {"vmin": float(landscape.energy.min()), "vmax": float(landscape.energy.max())}
+    mesh = axes.pcolormesh(
+        landscape.axes[first], landscape.axes[second], energy.T, shading="gouraud", rasterized=True, **limits
+    )
     axes.axhline(0, color="white", linewidth=0.6, linestyle=":")
     axes.axvline(0, color="white", linewidth=0.6, linestyle=":")
-    axes.plot(one.true[first], one.true[second], "+", color="white", markersize=9, markeredgewidth=2)
-    axes.plot(one.minimum[first], one.minimum[second], "o", color="white", markerfacecolor="none", markersize=10)
+    axes.plot(landscape.true[first], landscape.true[second], "+", color="white", markersize=9, markeredgewidth=2)
+    axes.plot(
+        landscape.minimum[first], landscape.minimum[second], "o", color="white", markerfacecolor="none", markersize=10
+    )
     unit = f" ({landscapes.unit})" if landscapes.unit else ""
     axes.set(xlabel=landscapes.axis_names[first] + unit, ylabel=landscapes.axis_names[second] + unit)
     return mesh
@@ -217,17 +225,17 @@ def _curves(axes: Any, seconds: np.ndarray, curves: Iterable[tuple[Curve, dict[s
     """Draw persistence and the curves with their intervals; return the lines for the legend."""
     drawn = [axes.axhline(1.0, color=GREY, linestyle="--")]
     for curve, style in curves:
-        low, high = [one.low for one in curve], [one.high for one in curve]
+        low, high = [point.low for point in curve], [point.high for point in curve]
         axes.fill_between(seconds, low, high, color=style["color"], alpha=0.15, linewidth=0)
-        drawn += axes.plot(seconds, [one.value for one in curve], marker="o", **style)
+        drawn += axes.plot(seconds, [point.value for point in curve], marker="o", **style)
     axes.set(xlabel="time ahead (s)")
     return drawn
 
 
 def _colours(names: Iterable[str]) -> dict[str, str]:
     """Return a colour for each model."""
-    others = itertools.cycle(_OTHERS)
-    return {name: _COLOURS.get(name) or next(others) for name in names}
+    further_colours = itertools.cycle(_FURTHER_COLOURS)
+    return {name: _COLOURS.get(name) or next(further_colours) for name in names}
 
 
 def _short(name: str) -> str:

@@ -82,12 +82,12 @@ class Metrics:
         return next((row for row in self.rows if row.key == key and row.model == name), None)
 
 
-def missing_parts(one: Evaluation) -> dict[str, str]:
+def missing_parts(evaluation: Evaluation) -> dict[str, str]:
     """Return the parts of an evaluation that were not measured, with the reasons."""
-    model = one.models[one.trained]
-    parts = {**vars(one), **vars(model), "base": one.base}
+    model = evaluation.models[evaluation.trained]
+    parts = {**vars(evaluation), **vars(model), "base": evaluation.base}
     return {
-        part: next((note for note in one.notes if word in note), needs)
+        part: next((note for note in evaluation.notes if word in note), needs)
         for part, (word, needs) in _NEEDS.items()
         if not parts.get(part)
     }
@@ -112,25 +112,25 @@ def read_metrics(folder: Path) -> Metrics:
             return TypeAdapter(Metrics).validate_json(path.read_bytes())
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        found = f"metrics that cannot be used ({place}: {describe_validation_error(first)})"
-        raise InputError(where=str(path), found=found, needed=f"format {FORMAT}", fix=fix) from None
+        key = ".".join(map(str, first["loc"]))
+        problem = f"metrics that cannot be read ({key}: {describe_validation_error(first)})"
+        raise InputError(where=str(path), found=problem, needed=f"format {FORMAT}", fix=fix) from None
     except MissingFileError:
-        found = f"no {METRICS_FILE}" if folder.is_dir() else "no such folder"
-        raise InputError(where=str(folder), found=found, fix=fix) from None
+        problem = f"no {METRICS_FILE}" if folder.is_dir() else "no such folder"
+        raise InputError(where=str(folder), found=problem, fix=fix) from None
 
 
 def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> dict[str, Any]:
     """Return all metrics as plain values; see docs/evaluation_reference.md for the meaning of each."""
-    one, clips, decoded, rows = evaluation, evaluation.clips, evaluation.decoded, make_rows(evaluation)
-    summary = summary or summarize(one, rows)
+    clips, decoded, rows = evaluation.clips, evaluation.decoded, make_rows(evaluation)
+    summary = summary or summarize(evaluation, rows)
     named = list(zip(clips.episode_ids, clips.starts, strict=True))
     metrics = {
         "format": FORMAT,
         "summary": {**vars(summary), "sentence": summary.sentence},
-        "trained": one.trained,
-        "base": one.base,
-        "about": one.about,
+        "trained": evaluation.trained,
+        "base": evaluation.base,
+        "about": evaluation.about,
         "clips": {
             "count": len(clips),
             "episodes": clips.episodes,
@@ -138,30 +138,32 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
             "fingerprint": hashlib.sha256(json.dumps(named).encode()).hexdigest()[:16],
             "named": named,
         },
-        "ranked": one.ranked,
+        "ranked": evaluation.ranked,
         "rows": rows,
         "by_clip": {
-            "persistence": one.errors.of("rollout", L1, "persistence"),
-            "models": {name: model.errors.of("rollout") for name, model in one.models.items()},
+            "persistence": evaluation.errors.of("rollout", L1, "persistence"),
+            "models": {name: model.errors.of("rollout") for name, model in evaluation.models.items()},
             "last_horizon": {
-                metric.name: {name: model.errors.of("rollout", metric)[:, -1] for name, model in one.models.items()}
-                for metric in one.metrics
+                metric.name: {
+                    name: model.errors.of("rollout", metric)[:, -1] for name, model in evaluation.models.items()
+                }
+                for metric in evaluation.metrics
             },
             "one_step": {
                 name: {
                     actions: model.errors.of("teacher_forced", actions=actions).mean(1)
                     for actions in get_args(ActionMode)
                 }
-                for name, model in one.models.items()
+                for name, model in evaluation.models.items()
             },
         },
         "models": {  # the arrays behind the rows; those of the errors are in `by_clip`
             name: {key: getattr(model, key) for key in ("role", "ranking", "landscapes", "distribution")}
-            for name, model in one.models.items()
+            for name, model in evaluation.models.items()
         },
         "decoded": None if decoded is None else {"decoder": decoded.decoder, "notes": decoded.notes},
-        "notes": one.notes,
-        "not_measured": missing_parts(one),
+        "notes": evaluation.notes,
+        "not_measured": missing_parts(evaluation),
     }
     plain: dict[str, Any] = to_jsonable_python(
         metrics, inf_nan_mode="null", fallback=lambda array: _rounded(array.tolist())
@@ -171,13 +173,13 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
 
 def _rounded(value: Any) -> Any:
     """Return the numbers of an array with 7 significant digits: more than a prediction in bfloat16 has."""
-    return [_rounded(one) for one in value] if isinstance(value, list) else float(f"{value:.7g}")
+    return [_rounded(item) for item in value] if isinstance(value, list) else float(f"{value:.7g}")
 
 
 def write_csv(rows: Sequence[Row], path: Path) -> Path:
     """Write all rows as CSV, atomically; columns are the fields of `Row`, missing numbers are nan."""
     text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, [one.name for one in fields(Row)], lineterminator="\n")
+    writer = csv.DictWriter(text, [field.name for field in fields(Row)], lineterminator="\n")
     writer.writeheader()
     writer.writerows(vars(row) for row in rows)
     write_atomically(path, text.getvalue())

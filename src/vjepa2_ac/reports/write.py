@@ -101,8 +101,8 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
     }
     environment.filters |= {"code": code_markup, "count": counted}
     environment.filters["number"] = lambda row: f"{format_percent(row.value)} %" if row.better else f"{row.value:.2f}"
-    environment.filters["baseline"] = lambda one: (
-        f"{100 * one.baseline:.0f} %" if one.unit == "%" else f"{one.baseline:.1f} {one.unit}"
+    environment.filters["baseline"] = lambda verdict: (
+        f"{100 * verdict.baseline:.0f} %" if verdict.unit == "%" else f"{verdict.baseline:.1f} {verdict.unit}"
     )
     return environment.get_template("report.html.jinja").render(
         evaluation=evaluation,
@@ -181,14 +181,16 @@ def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
     """
     decoded = () if evaluation.decoded is None else evaluation.decoded.strips[:MAX_CLIPS]
     examples = () if decoded else evaluation.examples[:MAX_CLIPS]
-    strips = [example_strip(evaluation, one) for one in examples] + [decoded_strip(evaluation, one) for one in decoded]
+    strips = [example_strip(evaluation, clip) for clip in examples] + [
+        decoded_strip(evaluation, clip) for clip in decoded
+    ]
     urls = webp_urls([[draw_strip(strip)] for strip in strips], at_most=_BYTES)
     images: dict[str, list[PageImage]] = {"examples": [], "decoded": []}
     shown: list[Example | DecodedStrip] = [*examples, *decoded]
-    for url, one, strip in zip(urls, shown, strips, strict=True):
+    for url, clip, strip in zip(urls, shown, strips, strict=True):
         alt = "; ".join(row.label.replace("\n", " ") for row in strip.rows)
-        part = "examples" if isinstance(one, Example) else "decoded"
-        images[part].append(PageImage(url, f"Rows of images: {alt}", one))
+        part = "examples" if isinstance(clip, Example) else "decoded"
+        images[part].append(PageImage(url, f"Rows of images: {alt}", clip))
     return images
 
 
@@ -210,7 +212,7 @@ def make_video(evaluation: Evaluation) -> PageVideo | None:
     if not strips:
         return None
     models = [name for name in (evaluation.base, evaluation.trained) if name is not None]
-    strip = next((one for one in strips if "median" in one.why), strips[0])
+    strip = next((clip for clip in strips if "median" in clip.why), strips[0])
     true = "truth" if "truth" in strip.rows else "decoded_truth"
     columns = [strip.rows[name] for name in (true, *models)]
     times = range(len(columns[0]))
@@ -227,26 +229,26 @@ def make_video(evaluation: Evaluation) -> PageVideo | None:
 def _frame(images: Sequence[Frame], passed: float) -> Frame:
     """Return images side by side with a progress bar below, for the share `passed` of the time."""
     thin = max(1, images[0].shape[1] // _THIN)
-    with_gaps = [np.pad(one, ((0, thin), (0, thin), (0, 0)), constant_values=_GREY) for one in images]
+    with_gaps = [np.pad(image, ((0, thin), (0, thin), (0, 0)), constant_values=_GREY) for image in images]
     frame = np.concatenate(with_gaps, axis=1)[:, :-thin]
     frame[-thin:, : round(passed * frame.shape[1])] = _PASSED
     return frame
 
 
-def webp_urls(films: Sequence[Sequence[Frame]], seconds: Sequence[float] = (1.0,), *, at_most: int) -> list[str]:
+def webp_urls(videos: Sequence[Sequence[Frame]], seconds: Sequence[float] = (1.0,), *, at_most: int) -> list[str]:
     """Encode videos (or images, as single frames) as WebP data: URLs, in the best quality within a size limit.
 
     Args:
-        films: The frames of each video.
+        videos: The frames of each video.
         seconds: Display time of each frame.
         at_most: Largest total size in bytes. If the lowest quality exceeds it, the lowest quality is used.
     """
     encoded: list[bytes] = []
     for quality in _QUALITIES:
-        encoded = [base64.b64encode(encode_webp(one, seconds, quality=quality)) for one in films]
+        encoded = [base64.b64encode(encode_webp(frames, seconds, quality=quality)) for frames in videos]
         if sum(map(len, encoded)) <= at_most:
             break
-    return [f"data:image/webp;base64,{one.decode()}" for one in encoded]
+    return [f"data:image/webp;base64,{data.decode()}" for data in encoded]
 
 
 @dataclass(frozen=True)
@@ -265,7 +267,7 @@ class WrittenEvaluation:
     @property
     def error_over_persistence(self) -> dict[str, Curve]:
         """L1 rollout error of each model relative to persistence, by horizon (index h - 1)."""
-        return {name: over_persistence(one.errors, "rollout") for name, one in self.evaluation.models.items()}
+        return {name: over_persistence(model.errors, "rollout") for name, model in self.evaluation.models.items()}
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path) -> WrittenEvaluation:

@@ -87,7 +87,7 @@ class Planning:
         spaces = self.controller.spaces
         state = observation.joints if spaces.state.position is None else observation.state
         if state is None:
-            raise ValueError(f"{self.name} moves joints, which this environment does not measure")
+            raise ValueError(f"{self.name} needs joint angles, which this environment does not measure")
         action = self.controller.act(observation.image, state)
         self.why = self.controller.decision.why if self.controller.decision else ""
         return action - state if spaces.action.follows == "target" else action
@@ -104,18 +104,22 @@ def require_measured_inputs(subject: Subject, *, world: bool) -> None:
         InputError: The model cannot act in this environment.
     """
     data = subject.config.data
-    require_stride(data, to="act", fix="Say which, as data.stride=4")
+    require_stride(data, to="act", fix="Set the stride, for example data.stride=4")
     if data.pose_frame != "base":
-        needed = "base: the simulated arm moves in the frame of its base"
+        needed = "base, because the simulated arm moves in its base frame"
         raise InputError(where="data.pose_frame", found=data.pose_frame, needed=needed)
     if data.states == "vector" and not (isinstance(data, RldsData) and data.fields.state == JOINT_FIELDS):
-        found = "a model of other numbers than the simulated arm measures"
-        needed = f"poses; or seven joint angles and the gripper: data.fields.state: [{', '.join(JOINT_FIELDS)}]"
-        raise InputError(where="data.states: vector", found=found, needed=needed)
+        problem = "states that the simulated arm does not measure"
+        needed = f"poses, or seven joint angles and the gripper (data.fields.state: [{', '.join(JOINT_FIELDS)}])"
+        raise InputError(where="data.states: vector", found=problem, needed=needed)
     uses_camera = subject.world_model.sizes.predictor.use_extrinsics
     if world and (uses_camera or data.states == "vector"):
-        found = "a model that takes the pose of the camera" if uses_camera else "a model of joints"
-        raise InputError(where="--world", found=found, needed="a model of poses: environments measure nothing else")
+        problem = "a model with the camera pose as input" if uses_camera else "a model of joint angles"
+        raise InputError(
+            where="--world",
+            found=problem,
+            needed="a model of end-effector poses, which is all that environments measure",
+        )
 
 
 def make_policy(subject: Subject, arm: SimulatedArm | None) -> Planning:
@@ -280,35 +284,37 @@ def demonstrate(trial: Trial, arm: SimulatedArm, limits: LimitsConfig) -> Episod
     episode = run_trial(ArmEnvironment(arm), Oracle(free), replace(trial, steps=steps), keep_frames=True)
     if not episode.success:
         where = f"demonstration of problem {trial.seed} ({task})"
-        left = f"{100 * episode.distances_m[-1]:.1f} cm from its goal after {counted(steps, 'model step')}"
-        fix = "Allow it longer steps along each axis (planning.limits.xyz), or more of them"
-        raise InputError(where=where, found=f"the oracle ends {left}", needed="a demonstration that succeeds", fix=fix)
+        distance = f"{100 * episode.distances_m[-1]:.1f} cm from the goal after {counted(steps, 'model step')}"
+        fix = "Raise the step limits (planning.limits.xyz) or the number of steps"
+        raise InputError(
+            where=where, found=f"the oracle stops {distance}", needed="a demonstration that succeeds", fix=fix
+        )
     return episode
 
 
-def goals_of_episode(shown: EpisodeResult, keys: Sequence[KeyFrame], sub_goals: SubGoals) -> tuple[SubGoal, ...]:
+def goals_of_episode(episode: EpisodeResult, keys: Sequence[KeyFrame], sub_goals: SubGoals) -> tuple[SubGoal, ...]:
     """Return frames of an episode as sub-goals.
 
     The allowed duration of each sub-goal is that in the episode, plus or minus 3 model steps (1 for `every-step`).
     """
-    images = [] if shown.frames is None else [shown.frames[key.frame] for key in keys]
-    return make_sub_goals(images, keys, Timing(1, slack=1 if sub_goals == "every-step" else 3), shown.states)
+    images = [] if episode.frames is None else [episode.frames[key.frame] for key in keys]
+    return make_sub_goals(images, keys, Timing(1, slack=1 if sub_goals == "every-step" else 3), episode.states)
 
 
 def with_goals(trials: Trials, goals: Sequence[Sequence[SubGoal]]) -> Trials:
     """Return trials with the given sub-goals."""
     pairs = zip(trials.trials, goals, strict=True)
-    return replace(trials, trials=tuple(replace(trial, goals=tuple(made)) for trial, made in pairs))
+    return replace(trials, trials=tuple(replace(trial, goals=tuple(sub_goals)) for trial, sub_goals in pairs))
 
 
 def run_policies(
-    environment: Environment, policies: Sequence[Policy], trials: Trials, films: int, reporter: Reporter
+    environment: Environment, policies: Sequence[Policy], trials: Trials, num_videos: int, reporter: Reporter
 ) -> tuple[ClosedLoopResult, ...]:
     """Run several policies in the same trials; store frames for a video for the first policy only."""
     results = list[ClosedLoopResult]()
     for policy in policies:
         progress = reporter.task(f"{trials.task}: {policy.name}", "decisions")
-        results.append(run_trials(environment, policy, trials, 0 if results else films, progress))
+        results.append(run_trials(environment, policy, trials, 0 if results else num_videos, progress))
     return tuple(results)
 
 
@@ -340,7 +346,7 @@ def write_benchmark(benchmark: ClosedLoopBenchmark, folder: Path, verdict: Mappi
 
 def _metrics(result: ClosedLoopResult) -> dict[str, Any]:
     return {
-        **{name: None if one is None else one.as_dict() for name, one in result.estimates.items()},
+        **{name: None if estimate is None else estimate.as_dict() for name, estimate in result.estimates.items()},
         "why_counts": result.why_counts,
         "unreachable_commands": int(result.unreachable.sum()),
         "by_episode": {

@@ -163,10 +163,10 @@ class RayCamera:
         near = behind.from_lamp.near_arm(self._caster, data)
         dark = near[self._caster.shaded(data, self._lamp, behind.spots[near], ARM_GROUP)]
         pixels[dark] = behind.shaded[dark]
-        seen, hits = self._see_arm(data, behind)
-        spots = behind.from_camera.origin + behind.from_camera.rays[seen] * hits.distance_m[:, None]
+        visible, hits = self._see_arm(data, behind)
+        spots = behind.from_camera.origin + behind.from_camera.rays[visible] * hits.distance_m[:, None]
         ambient, direct = self._light(data, spots, hits, ARM_GROUP)
-        pixels[seen] = _as_bytes(ambient + direct)
+        pixels[visible] = _as_bytes(ambient + direct)
         return pixels.reshape(self._height, self._width, 3)
 
     def silhouette(self, data: Any) -> Bool[np.ndarray, "height width"]:
@@ -176,7 +176,7 @@ class RayCamera:
         shown[self._see_arm(data, behind)[0]] = True
         return shown.reshape(self._height, self._width)
 
-    def _see_arm(self, data: Any, behind: _Background) -> tuple[Int[np.ndarray, " seen"], Hits]:
+    def _see_arm(self, data: Any, behind: _Background) -> tuple[Int[np.ndarray, " visible"], Hits]:
         """Return the pixels that show the arm, the block or moving objects, and the hits of their rays."""
         view = behind.from_camera
         near = view.near_arm(self._caster, data)
@@ -239,8 +239,10 @@ class _Colours:
 def _vary_pattern(pattern: Callable[[Any], Any], rng: np.random.Generator) -> Callable[[Any], Any]:
     """Return a pattern with random rotation, scale and contrast."""
     turn, scale, strength = rng.uniform(0.0, np.pi), rng.uniform(0.5, 2.0), rng.uniform(0.5, 2.5)
-    ways = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, scale]]) / scale
-    return lambda spots: 1.0 + strength * (pattern(spots @ ways) - 1.0)
+    transform = (
+        np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, scale]]) / scale
+    )
+    return lambda spots: 1.0 + strength * (pattern(spots @ transform) - 1.0)
 
 
 def _planks(spots: Any) -> Any:

@@ -107,8 +107,8 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
     if camera not in RECORDED_CAMERAS:
         raise InputError(where=where, found=f"camera {camera!r}", needed=f"one of {', '.join(RECORDED_CAMERAS)}")
     if episode.states.shape != (steps, 7):
-        found, needed = "x".join(map(str, episode.states.shape)), f"{steps}x7, as simulated: data.states: pose"
-        raise InputError(where=where, found=f"states of {found} numbers", needed=needed)
+        shape, needed = "x".join(map(str, episode.states.shape)), f"{steps}x7, as simulated: data.states: pose"
+        raise InputError(where=where, found=f"states of {shape} numbers", needed=needed)
     eye = (
         RECORDED_CAMERAS[camera] if simulation.cameras == 3 else "exterior_1"
     )  # a recording with one camera repeats its image
@@ -116,9 +116,9 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
     off = np.abs(again.simulate(np.zeros((0, 7)), 1).states[0] - np.asarray(episode.states[start], dtype=np.float64))
     off[3:6] = np.minimum(off[3:6], np.abs(2 * np.pi - off[3:6]))  # -pi and pi are the same angle
     if off.max() > _STATE_TOLERANCE:
-        found = f"simulated again, the state differs by up to {off.max():.2g}"
+        problem = f"simulated again, the state differs by up to {off.max():.2g}"
         fix = f"Record it again with these versions of the libraries: {SIMULATION_FILE} names those that recorded it"
-        raise InputError(where=f"{where}: control step {start}", found=found, needed="what was recorded", fix=fix)
+        raise InputError(where=f"{where}: control step {start}", found=problem, needed="what was recorded", fix=fix)
     return again
 
 

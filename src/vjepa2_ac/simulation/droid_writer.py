@@ -76,8 +76,8 @@ def write_droid_rlds(
             num_bytes += len(record)
         stack.close()
         if min(counts) == 0:
-            found, needed = counted(sum(counts), "episode"), f"at least one for each of {shards} shards"
-            raise InputError(where=str(folder), found=found, needed=needed)
+            problem, needed = counted(sum(counts), "episode"), f"at least one for each of {shards} shards"
+            raise InputError(where=str(folder), found=problem, needed=needed)
         texts = {
             _FEATURES: json.dumps(described, indent=4, sort_keys=True),
             _INFO: json.dumps(dataset_info(_NAME, "1.0.0", counts, num_bytes), indent=2, sort_keys=True),

@@ -58,9 +58,8 @@ _MOTION, _WORLD, _SUCCESS = range(3)  # random streams of an episode
 class RecordingSpec:
     """The options that determine the episodes of a simulated data set."""
 
-    domain: str | Domain | DomainRanges = (
-        "A"  # a domain or its name; with ranges or `random` each episode has another one
-    )
+    # A domain or its name; with ranges, or `random`, a domain is drawn for each episode.
+    domain: str | Domain | DomainRanges = "A"
     steps: Annotated[int, Field(ge=2, le=1_000_000)] = 41  # control steps (15 per second); see `default_steps`
     seed: Annotated[int, Field(ge=0)] = 0  # determines motion, outcome and worlds
     cameras: Literal[1, 2, 3] = 1  # number of rendered cameras, fixed ones first; the others repeat the first image
@@ -100,11 +99,11 @@ def execute_episode(
         arm: An arm from `make_arm`.
         index: Number of the episode.
         spec: The options of the recording.
-        until: Control step whose measured state arm and block have afterwards; None: after the last one.
+        until: Control step at which the episode stops, with arm and block in its measured state; None: the last one.
         on_step: Called with the arm at every control step.
     """
     rng = _stream(index, spec, _MOTION)
-    if spec.task is not None:  # contacts depend on all earlier steps, so these are simulated, too
+    if spec.task is not None:  # contacts depend on all earlier steps, so these are simulated as well
         return play(arm, spec.task, spec.steps if until is None else until, rng, script=index % 2 == 0, on_step=on_step)
     arm.reset_clock()
     motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)
@@ -120,8 +119,8 @@ def episode_folder(index: int, seed: int, domain_name: str) -> str:
     """Return the source folder that is stored in the episode. As in DROID, only its name contains the outcome."""
     succeeded = np.random.default_rng([seed, index, _SUCCESS]).uniform() < SUCCESS_SHARE
     minute, hour, day = index % 60, index // 60 % 24, 1 + index // 1440 % 28
-    place = f"{domain_name}_seed{seed}_{hour:02d}h{minute:02d}_{index:06d}"
-    return f"/simulated/SIM/{'success' if succeeded else 'failure'}/2026-01-{day:02d}/{place}"
+    name = f"{domain_name}_seed{seed}_{hour:02d}h{minute:02d}_{index:06d}"
+    return f"/simulated/SIM/{'success' if succeeded else 'failure'}/2026-01-{day:02d}/{name}"
 
 
 def _stream(index: int, spec: RecordingSpec, purpose: int) -> np.random.Generator:
@@ -161,12 +160,12 @@ def record_dataset(
     """
     load_mujoco()
     if min(episodes, spec.steps - 1, workers, 1 if shards is None else shards, spec.seed + 1) < 1:
-        found = f"episodes {episodes}, steps {spec.steps}, shards {shards}, workers {workers}, seed {spec.seed}"
+        problem = f"episodes {episodes}, steps {spec.steps}, shards {shards}, workers {workers}, seed {spec.seed}"
         needed = "at least 1 episode, 2 steps, 1 shard, 1 worker, seed 0"
-        raise InputError(where="simulate record", found=found, needed=needed)
+        raise InputError(where="simulate record", found=problem, needed=needed)
     record = partial(record_episode, spec=replace(spec, domain=spec.worlds))
 
-    def watched() -> Iterator[DroidEpisode]:
+    def episodes_with_progress() -> Iterator[DroidEpisode]:
         with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
             with safe_imports():  # `pool.map` starts the workers
                 recorded = (map if workers == 1 else pool.map)(record, range(episodes))
@@ -175,7 +174,7 @@ def record_dataset(
                 progress(done, episodes)
 
     notes = {SIMULATION_FILE: format_json(RecordedSimulation.of(spec, episodes).as_dict())}
-    return write_droid_rlds(folder, watched(), shards=shards or -(-episodes // 32), notes=notes)
+    return write_droid_rlds(folder, episodes_with_progress(), shards=shards or -(-episodes // 32), notes=notes)
 
 
 def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
@@ -188,11 +187,11 @@ def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
     arm = make_arm(index, spec)
     images: dict[str, list[bytes]] = {feature: [] for feature in CAMERAS[: spec.cameras]}
 
-    def take(arm: SimulatedArm) -> None:
+    def store_images(arm: SimulatedArm) -> None:
         for feature, jpegs in images.items():
             jpegs.append(encode_jpeg(arm.image(_SIMULATED_CAMERAS[feature]), quality=JPEG_QUALITY))
 
-    motion = execute_episode(arm, index, spec, on_step=take)
+    motion = execute_episode(arm, index, spec, on_step=store_images)
     folder = episode_folder(index, spec.seed, arm.domain.name)
     return DroidEpisode(
         file_path=f"{folder}/trajectory.h5",
@@ -230,8 +229,8 @@ def _velocity(positions: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "s
 # ---- simulation.json ----
 
 _PROGRAM, _LIBRARIES = "vjepa2-ac", ("mujoco", "numpy", "scipy", "simplejpeg")  # other versions may change last digits
-_NEEDED = "what `vjepa2-ac simulate record` writes"
-_AGAIN = "Record it again: the same options give the same episodes"
+_NEEDED = "a file written by `vjepa2-ac simulate record`"
+_RECORD_AGAIN = "Record the data set again; the same options give the same episodes"
 _NUMBER = re.compile(r"_(\d{6,})/")  # number of an episode in the result of `episode_folder`
 
 
@@ -246,8 +245,8 @@ class RecordedSimulation(RecordingSpec):
     @classmethod
     def of(cls, spec: RecordingSpec, episodes: int) -> RecordedSimulation:
         """Return the record of a data set. Domains are written out, so that it does not depend on later definitions."""
-        libraries, how = {name: version(name) for name in _LIBRARIES}, vars(spec) | {"domain": spec.worlds}
-        return cls(version=version(_PROGRAM), libraries=libraries, episodes=episodes, **how)
+        libraries, options = {name: version(name) for name in _LIBRARIES}, vars(spec) | {"domain": spec.worlds}
+        return cls(version=version(_PROGRAM), libraries=libraries, episodes=episodes, **options)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of the file as plain values; one of the keys `domain` and `ranges` is None."""
@@ -265,9 +264,12 @@ class RecordedSimulation(RecordingSpec):
         name = self.domain.name if isinstance(self.domain, Domain) else "random"
         if number < self.episodes and f"{episode_folder(number, self.seed, name)}/" in episode_id:
             return number
-        found, needed = f"not the episode {episode_id!r}", f"one of {self.episodes} simulated with seed {self.seed}"
-        fix = "Episodes are told apart by the folder in their identity; keep data.fields.identity as it is"
-        raise InputError(where=SIMULATION_FILE, found=found, needed=needed, fix=fix)
+        problem, needed = (
+            f"an unknown episode, {episode_id!r}",
+            f"one of the {self.episodes} episodes recorded with seed {self.seed}",
+        )
+        fix = "Episodes are identified by the folder in their identity. Leave data.fields.identity at its default"
+        raise InputError(where=SIMULATION_FILE, found=problem, needed=needed, fix=fix)
 
 
 def read_simulation(folder: str | Path) -> RecordedSimulation:
@@ -283,12 +285,16 @@ def read_simulation(folder: str | Path) -> RecordedSimulation:
     """
     where = storage.join(str(folder), SIMULATION_FILE)
     try:
-        values = read_json_object(where, needed=_NEEDED, fix=_AGAIN)
+        values = read_json_object(where, needed=_NEEDED, fix=_RECORD_AGAIN)
     except MissingFileError:
-        found = "no such file: these are not simulated episodes, or an older version recorded them"
-        fix = f"What happens under other actions can only be simulated. {_AGAIN}"
-        raise InputError(where=where, found=found, needed=_NEEDED, fix=fix) from None
-    worlds = [one for key in ("domain", "ranges") if (one := values.pop(key, None)) is not None]
+        problem = "no such file; the data were not simulated, or were recorded by an older version"
+        fix = f"Outcomes of other actions are available for simulated data only. {_RECORD_AGAIN}"
+        raise InputError(where=where, found=problem, needed=_NEEDED, fix=fix) from None
+    worlds = [world for key in ("domain", "ranges") if (world := values.pop(key, None)) is not None]
     if len(worlds) != 1:
-        raise InputError(where=where, found="not one of the keys domain and ranges", needed=_NEEDED, fix=_AGAIN)
-    return parse_record(RecordedSimulation, values | {"domain": worlds[0]}, where=where, needed=_NEEDED, fix=_AGAIN)
+        raise InputError(
+            where=where, found="both or neither of the keys domain and ranges", needed=_NEEDED, fix=_RECORD_AGAIN
+        )
+    return parse_record(
+        RecordedSimulation, values | {"domain": worlds[0]}, where=where, needed=_NEEDED, fix=_RECORD_AGAIN
+    )

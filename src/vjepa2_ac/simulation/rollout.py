@@ -23,7 +23,7 @@ from vjepa2_ac.spaces import apply_action
 
 Image = UInt8[np.ndarray, "height width 3"]
 Action = Float[np.ndarray, " dim"]
-_PARTS = 8  # number of parts into which an unreachable displacement is divided
+_NUM_PARTS = 8  # number of parts into which an unreachable displacement is divided
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ def iterate_steps(environment: Environment, policy: Policy, trial: Trial) -> Ite
         if action is not None:
             action = np.asarray(action, dtype=np.float64)
             if action.shape not in {(7,), (8,)} or not np.isfinite(action).all():
-                raise ValueError(f"{policy.name}: {action.tolist()} is no action of 7 or 8 finite numbers")
+                raise ValueError(f"{policy.name}: {action.tolist()} is not an action of 7 or 8 finite numbers")
         observation, _, _, _, info = environment.step(action)
         yield Step(observation, info, action, seconds, policy.why)
 
@@ -233,7 +233,7 @@ class ArmEnvironment:
             ValueError: The action is None.
         """
         if action is None:
-            raise ValueError("the simulated arm has no expert: use the policy Oracle")
+            raise ValueError("the simulated arm has no expert. Use the policy Oracle")
         if len(action) == 7:
             is_reachable = send_action(self.arm, action, self._stride)
         else:
@@ -292,8 +292,8 @@ def target_state(state: State, action: State) -> State:
 
 def states_along(state: State, action: State) -> list[State]:
     """Return equally spaced states on the straight line from a state to the state after an action."""
-    shares = np.arange(1, _PARTS + 1)[:, None] / _PARTS
-    return list(apply_action(np.tile(state, (_PARTS, 1)), shares * action))
+    shares = np.arange(1, _NUM_PARTS + 1)[:, None] / _NUM_PARTS
+    return list(apply_action(np.tile(state, (_NUM_PARTS, 1)), shares * action))
 
 
 # ---- all trials ----
@@ -376,7 +376,7 @@ def _mean(values: Float[np.ndarray, " episodes"]) -> Estimate:
 
 
 def run_trials(
-    environment: Environment, policy: Policy, trials: Trials, films: int = 0, progress: Progress = no_progress
+    environment: Environment, policy: Policy, trials: Trials, num_videos: int = 0, progress: Progress = no_progress
 ) -> ClosedLoopResult:
     """Run a policy in all trials.
 
@@ -384,7 +384,7 @@ def run_trials(
         environment: The environment.
         policy: The policy.
         trials: The trials.
-        films: Number of first episodes whose frames are stored.
+        num_videos: Number of first episodes whose frames are stored.
         progress: Called with the number of finished decisions, from 0 on.
 
     Raises:
@@ -395,5 +395,5 @@ def run_trials(
     for trial in trials.trials:
         first = len(episodes) * trials.steps
         report = lambda step, first=first: progress(first + step, total)  # noqa: E731
-        episodes.append(run_trial(environment, policy, trial, keep_frames=len(episodes) < films, progress=report))
+        episodes.append(run_trial(environment, policy, trial, keep_frames=len(episodes) < num_videos, progress=report))
     return ClosedLoopResult(trials, policy.name, tuple(episodes))

@@ -76,7 +76,7 @@ class TaskProblem:
             ValueError: The task has no block.
         """
         if self.block_start is None or self.block_goal is None:
-            raise ValueError(f"{self.task} is done without a block")
+            raise ValueError(f"the task {self.task} has no block")
         return np.stack([self.block_start, self.block_goal])
 
     @property
@@ -95,7 +95,7 @@ class TaskProblem:
         if self.block_goal is None:
             return float(np.linalg.norm(state[:3] - self.goal[:3]))
         if block is None:
-            raise ValueError(f"{self.task} is done by a block, and there is none")
+            raise ValueError(f"the task {self.task} needs the pose of a block")
         return float(np.linalg.norm(block[:3] - self.block_goal[:3]))
 
     def succeeded(self, state: State, block: Block | None = None) -> bool:
@@ -126,13 +126,13 @@ def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskP
         seed: Seed of all problems.
         index: Number of the problem.
     """
-    drawn = _DRAW_PROBLEM[task](np.random.default_rng([seed, index, list(_DRAW_PROBLEM).index(task)]))
-    poses = poses_in_base(downward_poses(_with(drawn.flange, drawn.turn)), domain)
-    first, last = np.concatenate([poses, np.array(drawn.closedness)[:, None]], axis=1)
-    if drawn.blocks is None:
+    problem = _DRAW_PROBLEM[task](np.random.default_rng([seed, index, list(_DRAW_PROBLEM).index(task)]))
+    poses = poses_in_base(downward_poses(_append(problem.flange, problem.turn)), domain)
+    first, last = np.concatenate([poses, np.array(problem.closedness)[:, None]], axis=1)
+    if problem.blocks is None:
         return TaskProblem(task, index, first, last)
-    turns = drawn.blocks[:, 3:] - np.deg2rad(domain.base_yaw_deg)
-    blocks = np.concatenate([drawn.blocks[:, :3] @ domain.base_pose()[:3, :3], turns], axis=1)
+    turns = problem.blocks[:, 3:] - np.deg2rad(domain.base_yaw_deg)
+    blocks = np.concatenate([problem.blocks[:, :3] @ domain.base_pose()[:3, :3], turns], axis=1)
     return TaskProblem(task, index, first, last, *blocks)
 
 
@@ -146,7 +146,7 @@ class _WorldProblem:
     blocks: Float[np.ndarray, "2 4"] | None = None
 
 
-def _reach(rng: np.random.Generator) -> _WorldProblem:
+def _draw_reach(rng: np.random.Generator) -> _WorldProblem:
     recipe = MotionRecipe()
     low, high = np.array(recipe.low_m), np.array(recipe.high_m)
     start = rng.uniform(low, high)
@@ -156,7 +156,7 @@ def _reach(rng: np.random.Generator) -> _WorldProblem:
     return _WorldProblem(np.stack([start, goal]), turn, (closedness, closedness))
 
 
-def _push(rng: np.random.Generator) -> _WorldProblem:
+def _draw_push(rng: np.random.Generator) -> _WorldProblem:
     """Draw a problem of pushing forwards with the fingers' broad side, or sideways with one finger's outer side."""
     while True:
         turn = rng.uniform(-_MAX_TURN_RAD, _MAX_TURN_RAD)
@@ -164,50 +164,52 @@ def _push(rng: np.random.Generator) -> _WorldProblem:
         angle = turn + side * np.pi / 2
         ahead = np.array([np.cos(angle), np.sin(angle)])
         touching = BLOCK_M / 2 + (FINGER_OUTSIDE_M if side else FINGER_HALF_M)
-        before, way = rng.uniform(0.03, 0.07), rng.uniform(*PUSH_DISTANCE_M)
+        gap, distance = rng.uniform(0.03, 0.07), rng.uniform(*PUSH_DISTANCE_M)
         block = rng.uniform(*_BLOCK_AREA)
-        blocks = np.stack([block, block + way * ahead])
-        flange = blocks - ahead * np.array([[touching + before], [touching]])
-        if _inside(blocks, _BLOCK_AREA) and _inside(flange, _FLANGE_AREA):
-            return _WorldProblem(_with(flange, _PUSHING_M), turn, (1.0, 1.0), _with(_with(blocks, BLOCK_M / 2), turn))
+        blocks = np.stack([block, block + distance * ahead])
+        flange = blocks - ahead * np.array([[touching + gap], [touching]])
+        if _is_inside(blocks, _BLOCK_AREA) and _is_inside(flange, _FLANGE_AREA):
+            return _WorldProblem(
+                _append(flange, _PUSHING_M), turn, (1.0, 1.0), _append(_append(blocks, BLOCK_M / 2), turn)
+            )
 
 
-def _pick(rng: np.random.Generator) -> _WorldProblem:
+def _draw_pick(rng: np.random.Generator) -> _WorldProblem:
     turn = rng.uniform(-_MAX_TURN_RAD, _MAX_TURN_RAD)
     block = np.append(rng.uniform(*_GRASP_AREA), BLOCK_M / 2)
     lifted = block + np.append(rng.uniform(-0.03, 0.03, size=2), rng.uniform(*LIFT_M))
     above = block + np.append(rng.uniform(-0.04, 0.04, size=2), GRASP_M + rng.uniform(0.07, 0.12))
     flange = np.stack([above, lifted + np.array([0.0, 0.0, GRASP_M])])
-    return _WorldProblem(flange, turn, (0.0, HOLDING), _with(np.stack([block, lifted]), turn))
+    return _WorldProblem(flange, turn, (0.0, HOLDING), _append(np.stack([block, lifted]), turn))
 
 
-def _place(rng: np.random.Generator) -> _WorldProblem:
+def _draw_place(rng: np.random.Generator) -> _WorldProblem:
     while True:
         turn, angle = rng.uniform(-_MAX_TURN_RAD, _MAX_TURN_RAD), rng.uniform(-np.pi, np.pi)
         block = rng.uniform(*_GRASP_AREA)
-        places = np.stack([block, block + rng.uniform(*PLACE_DISTANCE_M) * np.array([np.cos(angle), np.sin(angle)])])
-        if _inside(places, _GRASP_AREA):
+        ends = np.stack([block, block + rng.uniform(*PLACE_DISTANCE_M) * np.array([np.cos(angle), np.sin(angle)])])
+        if _is_inside(ends, _GRASP_AREA):
             break
-    blocks = _with(places, BLOCK_M / 2)
+    blocks = _append(ends, BLOCK_M / 2)
     above = np.append(rng.uniform(-0.04, 0.04, size=2), GRASP_M + rng.uniform(0.07, 0.12))
     flange = blocks + np.stack([above, [0.0, 0.0, GRASP_M + rng.uniform(0.07, 0.10)]])
-    return _WorldProblem(flange, turn, (0.0, 0.0), _with(blocks, turn))
+    return _WorldProblem(flange, turn, (0.0, 0.0), _append(blocks, turn))
 
 
 _DRAW_PROBLEM: dict[TaskName, Callable[[np.random.Generator], _WorldProblem]] = {
-    "reach": _reach,
-    "push": _push,
-    "pick": _pick,
-    "place": _place,
+    "reach": _draw_reach,
+    "push": _draw_push,
+    "pick": _draw_pick,
+    "place": _draw_place,
 }
 """Functions that draw a problem. The order matters: a task's index is part of the seed of its problems."""
 
 
-def _inside(places: Float[np.ndarray, "places 2"], area: Float[np.ndarray, "2 2"]) -> bool:
-    return bool(((places >= area[0]) & (places <= area[1])).all())
+def _is_inside(points: Float[np.ndarray, "points 2"], area: Float[np.ndarray, "2 2"]) -> bool:
+    return bool(((points >= area[0]) & (points <= area[1])).all())
 
 
-def _with(points: Float[np.ndarray, "points dim"], value: float) -> Float[np.ndarray, "points dim+1"]:
+def _append(points: Float[np.ndarray, "points dim"], value: float) -> Float[np.ndarray, "points dim+1"]:
     """Append the same coordinate to all points."""
     return np.concatenate([points, np.full((len(points), 1), value)], axis=1)
 

@@ -61,20 +61,20 @@ from vjepa2_ac.storage.structured import parse_record
 
 _ANSWER_S = 120.0  # default timeout of an answer
 LOADING = 5  # factor of the timeout for the first answer
-_ENDS_S = 10.0  # time for a program to exit after its input is closed
-_MOST_BYTES = 64 << 20  # size limit of a line; fits an image of 16 million pixels in base64
-_MOST_SHOWN = 200  # bytes of an invalid line in an error message
+_EXIT_S = 10.0  # time for a program to exit after its input is closed
+_MAX_LINE_BYTES = 64 << 20  # size limit of a line; fits an image of 16 million pixels in base64
+_MAX_SHOWN_BYTES = 200  # bytes of an invalid line in an error message
 _ERROR_BYTES, _ERROR_LINES = 64 << 10, 5  # stored bytes and displayed lines of the error output
 _KEEPER = "import os, sys; world = int(sys.stdin.readline()); sys.stdin.read(); os.killpg(world, 9)"
-PROTOCOL = "docs/worlds.md has the protocol; examples/worlds programs that follow it"
+PROTOCOL = "docs/worlds.md has the protocol; examples/worlds has programs that implement it"
 TRIALS_PER_PROBLEM = 2  # at most this many times the required number of problems are tried with the expert
 
 
 class EnvironmentProcess(ExitStack):
-    """A program that answers each line of its input with one line; `close` ends it and all processes of its group.
+    """A program that answers each line of its input with one line; `close` stops it and all processes of its group.
 
     A second process, the keeper, kills the group when this process dies, even by SIGKILL, because the keeper's input is
-    then closed. Unlike prctl(PR_SET_PDEATHSIG), this works on every Unix and from any thread, and it also ends the
+    then closed. Unlike prctl(PR_SET_PDEATHSIG), this works on every Unix and from any thread, and it also kills the
     children of a shell.
 
     Args:
@@ -90,19 +90,19 @@ class EnvironmentProcess(ExitStack):
         super().__init__()
         self.where, self._timeout_s, self._errors = f"--world {command!r}", timeout_s or _ANSWER_S, b""
         try:
-            keeper = self._started([sys.executable, "-I", "-S", "-c", _KEEPER], DEVNULL)
+            keeper = self._start([sys.executable, "-I", "-S", "-c", _KEEPER], DEVNULL)
             self.callback(keeper.kill)
-            self._process = self._started(shlex.split(command) or [""], PIPE)
+            self._process = self._start(shlex.split(command) or [""], PIPE)
         except (OSError, ValueError) as error:
             self.close()
-            raise self.refused(f"it cannot be started: {error}") from None
+            raise self.error(f"the program cannot be started: {error}") from None
         keeper.stdin.write(b"%d\n" % self._process.pid)
         os.set_blocking(self._process.stdin.fileno(), False)
         self._output, self._poll = self._process.stdout.fileno(), select.poll()
         self._poll.register(self._output, select.POLLIN)
         self._reader = Thread(target=self._read_errors, daemon=True)
         self._reader.start()
-        self.callback(self._end)
+        self.callback(self._stop)
 
     def exchange(self, request: dict[str, Any] | None = None) -> dict[str, Any]:
         """Send a request and return the answer; without a request return the first message of the program.
@@ -112,31 +112,33 @@ class EnvironmentProcess(ExitStack):
         """
         if request is not None:
             self._send(f"{json.dumps(request)}\n".encode())
-        line = self._line(self._timeout_s * (LOADING if request is None else 1))
+        line = self._read_line(self._timeout_s * (LOADING if request is None else 1))
         try:
             answer = json.loads(line)
         except (ValueError, RecursionError):
-            raise self.refused(f"it wrote {_shown(line)}", "a JSON object in a line") from None
+            raise self.error(f"the program wrote {_shown(line)}", "one JSON object per line") from None
         if not isinstance(answer, dict) or "error" in answer:
-            raise self.refused(str(answer["error"] if isinstance(answer, dict) else answer))
+            raise self.error(str(answer["error"] if isinstance(answer, dict) else answer))
         return answer
 
-    def refused(self, found: str, needed: str = "", fix: str = PROTOCOL) -> InputError:
+    def error(self, problem: str, needed: str = "", fix: str = PROTOCOL) -> InputError:
         """Return an error that names the command of this environment."""
-        return InputError(where=self.where, found=found, needed=needed, fix=fix)
+        return InputError(where=self.where, found=problem, needed=needed, fix=fix)
 
-    def _started(self, words: list[str], errors: int) -> Any:
-        process = Popen(words, stdin=PIPE, stdout=PIPE, stderr=errors, bufsize=0, start_new_session=True)  # noqa: S603
+    def _start(self, command: list[str], stderr: int) -> Any:
+        process = Popen(command, stdin=PIPE, stdout=PIPE, stderr=stderr, bufsize=0, start_new_session=True)  # noqa: S603
         return self.enter_context(process)
 
     def _send(self, line: bytes) -> None:
-        if self._poll.poll(0) and (unasked := os.read(self._output, _MOST_SHOWN)):
-            raise self.refused(f"it wrote {_shown(unasked)} without a request", "one answer for each request")
-        with suppress(BrokenPipeError):  # the program has exited, which `_line` reports
+        if self._poll.poll(0) and (unrequested := os.read(self._output, _MAX_SHOWN_BYTES)):
+            raise self.error(
+                f"the program wrote {_shown(unrequested)} without a request", "exactly one answer to each request"
+            )
+        with suppress(BrokenPipeError):  # the program has exited, which `_read_line` reports
             if self._process.stdin.write(line) is None:  # lines below PIPE_BUF are written completely or not at all
-                raise self.refused("it does not read its requests", "one answer for each request")
+                raise self.error("the program does not read its requests", "exactly one answer to each request")
 
-    def _line(self, limit_s: float) -> bytes:
+    def _read_line(self, limit_s: float) -> bytes:
         """Return the next line of the program's output.
 
         Raises:
@@ -145,44 +147,44 @@ class EnvironmentProcess(ExitStack):
         parts, end_s = [b""], time.monotonic() + limit_s
         while b"\n" not in parts[-1]:
             if not self._poll.poll(1000 * max(0.0, end_s - time.monotonic())):
-                now = f"now {self._timeout_s:g} s, and {LOADING} times as long for the first answer"
-                raise self._with_errors(f"no answer within {limit_s:g} s", f"Raise --world-timeout ({now})")
+                current = f"now {self._timeout_s:g} s; {LOADING} times as long for the first answer"
+                raise self._error_with_output(f"no answer within {limit_s:g} s", f"Raise --world-timeout ({current})")
             parts.append(os.read(self._output, 1 << 20))
             if not parts[-1]:
                 with suppress(TimeoutExpired):
-                    self._process.wait(min(_ENDS_S, self._timeout_s))
+                    self._process.wait(min(_EXIT_S, self._timeout_s))
                     self._reader.join(1.0)
                 status = self._process.returncode
-                ended = "closed its output" if status is None else f"ended with status {status}"
-                raise self._with_errors(f"it has {ended}")
-            if sum(map(len, parts)) > _MOST_BYTES:
-                raise self.refused(f"a line of more than {_MOST_BYTES >> 20} MiB", "a JSON object in a line")
+                ending = "closed its output" if status is None else f"exited with status {status}"
+                raise self._error_with_output(f"the program {ending}")
+            if sum(map(len, parts)) > _MAX_LINE_BYTES:
+                raise self.error(f"a line of more than {_MAX_LINE_BYTES >> 20} MiB", "one JSON object per line")
         line, _, rest = b"".join(parts).partition(b"\n")
         if rest:
-            raise self.refused(f"it wrote {_shown(rest)} after its answer", "one answer for each request")
+            raise self.error(f"the program wrote {_shown(rest)} after its answer", "exactly one answer to each request")
         return line
 
-    def _with_errors(self, found: str, fix: str = PROTOCOL) -> InputError:
+    def _error_with_output(self, problem: str, fix: str = PROTOCOL) -> InputError:
         lines = self._errors.decode(errors="replace").strip().splitlines()[-_ERROR_LINES:]
-        return self.refused("\n".join([found, *(line[:_MOST_SHOWN] for line in lines)]) + "\n", fix=fix)
+        return self.error("\n".join([problem, *(line[:_MAX_SHOWN_BYTES] for line in lines)]) + "\n", fix=fix)
 
     def _read_errors(self) -> None:
         """Read the error output continuously and store its end, so that the program never blocks on a full pipe."""
         while part := self._process.stderr.read(_ERROR_BYTES):
             self._errors = (self._errors + part)[-_ERROR_BYTES:]
 
-    def _end(self) -> None:
+    def _stop(self) -> None:
         self._process.stdin.close()
         self._process.stdout.close()
         with suppress(TimeoutExpired):
-            self._process.wait(min(_ENDS_S, self._timeout_s))
+            self._process.wait(min(_EXIT_S, self._timeout_s))
         with suppress(OSError):  # all processes of the group have exited already
             os.killpg(self._process.pid, signal.SIGKILL)
         self._reader.join(1.0)
 
 
 def _shown(line: bytes) -> str:
-    return repr(line[:_MOST_SHOWN].decode(errors="replace").strip())
+    return repr(line[:_MAX_SHOWN_BYTES].decode(errors="replace").strip())
 
 
 @dataclass(frozen=True)
@@ -198,7 +200,7 @@ class EnvironmentInfo:
 
 
 class ExternalEnvironment(EnvironmentProcess):
-    """A third-party environment that runs as a program; `close` ends it. It implements `rollout.Environment`.
+    """A third-party environment that runs as a program; `close` stops it. It implements `rollout.Environment`.
 
     Args:
         command: The program and its arguments in shell syntax, such as PYTHON examples/worlds/robosuite.py Lift.
@@ -213,7 +215,11 @@ class ExternalEnvironment(EnvironmentProcess):
         self._image_shape: tuple[int, ...] | None = None  # image shape of the first observation
         try:
             self.about = parse_record(
-                EnvironmentInfo, self.exchange(), where=self.where, needed="what it is", fix=PROTOCOL
+                EnvironmentInfo,
+                self.exchange(),
+                where=self.where,
+                needed="a description of the environment",
+                fix=PROTOCOL,
             )
         except BaseException:
             self.close()
@@ -226,7 +232,7 @@ class ExternalEnvironment(EnvironmentProcess):
             InputError: The program has exited, or its answer is invalid.
         """
         self._stride = options["stride"]
-        return self._ask(do="reset", seed=seed)
+        return self._request(do="reset", seed=seed)
 
     def step(self, action: Action | None) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Command the pose after an action for one model step; None: let the expert act.
@@ -235,18 +241,18 @@ class ExternalEnvironment(EnvironmentProcess):
             InputError: As for `reset`.
         """
         target = None if action is None else target_state(self._state, action)
-        words = None if target is None else target.tolist()
-        observation, info = self._ask(do="step", target=words, steps=self._stride)
+        target_values = None if target is None else target.tolist()
+        observation, info = self._request(do="step", target=target_values, steps=self._stride)
         info.setdefault("target", observation.state if target is None else target)
         return observation, -info["distance_m"], info["success"], False, info
 
-    def _ask(self, **request: Any) -> tuple[Observation, dict[str, Any]]:
+    def _request(self, **request: Any) -> tuple[Observation, dict[str, Any]]:
         answer = self.exchange(request)
         try:
             image, distance_m, is_done = _image(answer["image"]), float(answer["distance_m"]), answer["success"]
             self._image_shape = self._image_shape or image.shape
             if image.shape != self._image_shape:
-                raise ValueError(f"an image of {image.shape} after others of {self._image_shape}")  # noqa: TRY301
+                raise ValueError(f"an image with shape {image.shape} after images with shape {self._image_shape}")  # noqa: TRY301
             if not (np.isfinite(distance_m) and isinstance(is_done, bool)):
                 raise ValueError(f"distance_m {distance_m}, success {is_done!r}")  # noqa: TRY301
             info: dict[str, Any] = {"distance_m": distance_m, "success": is_done}
@@ -256,8 +262,8 @@ class ExternalEnvironment(EnvironmentProcess):
             self._state = self._pose(answer["state"], "state")
             return Observation(image, self._state), info
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            found = f"no {error}" if isinstance(error, KeyError) else str(error)
-            raise self.refused(found, "image, state, distance_m and success") from None
+            problem = f"an answer without {error}" if isinstance(error, KeyError) else str(error)
+            raise self.error(problem, "an answer with image, state, distance_m and success") from None
 
     def _pose(self, numbers: Any, name: str = "target") -> np.ndarray:
         pose = np.array(numbers, dtype=np.float64)
@@ -312,8 +318,11 @@ def find_trials(
     """
     about = world.about
     if not about.expert:
-        found, needed = f"{about.world} {about.task} has no expert", "one: it shows the goals, and what can be reached"
-        raise world.refused(found, needed)
+        problem, needed = (
+            f"{about.world} {about.task} has no expert",
+            "an expert, which provides the goals and shows that the problems can be solved",
+        )
+        raise world.error(problem, needed)
     steps = options.steps or -(-about.steps // stride)
     trials, episodes, left_out = list[Trial](), list[EpisodeResult](), list[int]()
     for seed in range(options.seed, options.seed + TRIALS_PER_PROBLEM * options.episodes):
@@ -336,12 +345,12 @@ def find_trials(
             break
     else:
         tried = counted(len(trials) + len(left_out), "problem")
-        found = f"the expert solves {len(trials)} of {tried} in {counted(steps, 'model step')}"
-        raise world.refused(found, "half of them", "Allow more of them with --steps")
-    chosen = {key: getattr(options, key) for key in ("episodes", "seed", "sub_goals")}
+        problem = f"the expert solves {len(trials)} of {tried} in {counted(steps, 'model step')}"
+        raise world.error(problem, "at least half of the problems", "Allow more model steps with --steps")
+    selected = {key: getattr(options, key) for key in ("episodes", "seed", "sub_goals")}
     seeds = {"seeds": [trial.seed for trial in trials], "left_out": left_out}
     length = {"stride": stride, "steps": steps, "seconds_per_step": stride / about.rate_hz}
-    values = {**vars(about), **chosen, **seeds, **length}
+    values = {**vars(about), **selected, **seeds, **length}
     solved = Trials(about.task, about.world, "done", stride / about.rate_hz, tuple(trials), values)
     return solved, ClosedLoopResult(solved, Expert.name, tuple(episodes))
 
@@ -349,16 +358,11 @@ def find_trials(
 # ---- recording of the expert, and of random play ----
 
 REST_S = 0.5  # an episode ends this long after success
-DISTURBANCE_M, DISTURBANCE_S, DISTURBANCE_PERIOD_S = (
-    0.02,
-    0.3,
-    1.5,
-)  # standard deviation per axis, duration and period of a disturbance
-TARGET_DURATION_S, BOX_MARGIN_M, GRIPPER_CHANGE_SHARE = (
-    (0.3, 1.0),
-    0.05,
-    0.3,
-)  # play: duration of a target, margin of the box, share of gripper changes
+DISTURBANCE_M, DISTURBANCE_S = 0.02, 0.3  # standard deviation per axis, and duration, of a disturbance
+DISTURBANCE_PERIOD_S = 1.5  # time from the start of a disturbance to the start of the next
+TARGET_DURATION_S = 0.3, 1.0  # random play: range of the duration of a target
+BOX_MARGIN_M = 0.05  # random play: margin of the box around the expert's positions
+GRIPPER_CHANGE_SHARE = 0.3  # random play: share of targets at which the gripper is set to open or closed at random
 POSITION_STRIDE = 4  # control steps between two expert positions from which the box of random play is computed
 DISTURBED, PLAY = 1, 2  # kind of an episode by the remainder of its seed divided by three
 
@@ -379,7 +383,7 @@ class _DisturbedExpert(Expert):
         return None if phase >= self._length else _action_to(self._target, observation)
 
 
-class _Play(Expert):
+class _RandomPlay(Expert):
     """Moves to random positions in a box around the expert's positions, and sometimes opens or closes the gripper."""
 
     def __init__(self, world: ExternalEnvironment, seed: int, every: int) -> None:
@@ -387,10 +391,8 @@ class _Play(Expert):
         self._rate_hz, self._until = world.about.rate_hz, 0.0
         expert = iterate_steps(world, Expert(), Trial(seed, world.about.steps // POSITION_STRIDE, POSITION_STRIDE))
         points = [step.observation.state[:3] for step in expert]
-        self._low, self._high = (
-            np.min(points, axis=0) - [BOX_MARGIN_M, BOX_MARGIN_M, 0.0],
-            np.max(points, axis=0) + BOX_MARGIN_M,
-        )
+        self._low = np.min(points, axis=0) - [BOX_MARGIN_M, BOX_MARGIN_M, 0.0]  # not below the expert's lowest position
+        self._high = np.max(points, axis=0) + BOX_MARGIN_M
 
     def act(self, observation: Observation) -> Action | None:
         step = next(self._steps)
@@ -444,13 +446,13 @@ def record_world(
 
 def _record(world: ExternalEnvironment, file: Path, seed: int, every: int) -> None:
     about, kind = world.about, seed % 3
-    policies = {DISTURBED: _DisturbedExpert, PLAY: _Play}
+    policies = {DISTURBED: _DisturbedExpert, PLAY: _RandomPlay}
     policy = policies[kind](world, seed, every) if kind else Expert()
-    steps, rested = list[Step](), -every
+    steps, steps_after_success = list[Step](), -every
     for step in iterate_steps(world, policy, Trial(seed, -(-about.steps // every), every)):
         steps.append(step)
-        rested = rested + every if step.info["success"] else 0
-        if kind != PLAY and rested >= REST_S * about.rate_hz:
+        steps_after_success = steps_after_success + every if step.info["success"] else 0
+        if kind != PLAY and steps_after_success >= REST_S * about.rate_hz:
             break
     with translate_write_errors(file), atomic_writer(file) as stream:
         np.savez(
