@@ -5,8 +5,8 @@
         planning.limits.workspace=[[0.3,-0.4,0.1],[0.7,0.4,0.6]]
     python droid_client.py CAMERA SERVER KEY cup      # needs: pip install openpi-client typing_extensions
 
-CAMERA is the name of an image in `env.get_observation()["image"]`: the left image of an exterior camera. Its images must
-have the size of the goal images. An error of the server or of the robot ends the loop, and the arm stops.
+CAMERA is the name of an image in `env.get_observation()["image"]`: the left image of an exterior camera. Its images
+must have the size of the goal images. An error of the server or of the robot ends the loop, and the arm stops.
 """
 
 from __future__ import annotations

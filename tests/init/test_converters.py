@@ -142,13 +142,17 @@ def damage_video(folder: Path) -> None:
     ("changes", "damage", "message"),
     [
         ({"rows": STATES[:-2]}, None, "18 rows for 20 frames"),
-        ({"header": "x,y,z,roll,pitch,yaw,grip"}, None, "no column gripper; it has x, y, z, roll, pitch, yaw, grip"),
+        (
+            {"header": "x,y,z,roll,pitch,yaw,grip"},
+            None,
+            "no column gripper; the table has x, y, z, roll, pitch, yaw, grip",
+        ),
         ({}, drop_table, r"first.mp4: no table of poses. Expected first.csv"),
         ({}, damage_video, r"first.mp4: not a readable video"),
         (
             {"header": f"time,{EULER_HEADER}", "rows": np.insert(STATES, 0, 1.7e9, axis=1)},
             None,
-            "is `time` 0 at the first frame",
+            "Set `time` to 0 at the first frame",
         ),
         (
             {"header": f"time,{EULER_HEADER}", "rows": np.insert(STATES[::3], 0, np.arange(0, STEPS, 3) / 30, axis=1)},
@@ -289,7 +293,7 @@ ONE = "0.1,0.2,0.3,0.4,0.5,0.6,0.7"
         (PLAIN.encode("utf-16"), r"not a text table .*Save the table as CSV \(UTF-8\)"),
         (
             f"x,y,z,gripper\n{ONE}",
-            "no columns for the rotation; it has x, y, z, gripper. Expected roll, pitch, yaw, or",
+            "no columns for the rotation; the table has x, y, z, gripper. Expected roll, pitch, yaw, or",
         ),
         (f"x,y,z,rx,ry,rz,gripper\n{ONE}", "rx, ry, rz can be rotation_vector, euler_xyz or euler_xyz_degrees. Pass"),
         ("x,y,z,qx,qy,qz,qw,gripper\n0,0,0,0,0,0,1,0\n0,0,0,0,0,0,0,0", "line 3: 0, 0, 0, 0. Expected quaternion_xyzw"),

@@ -21,4 +21,4 @@ def test_progress_is_0_at_the_start_and_1_at_the_end(
         own = [row for row in rows if row["episode_index"] == episode]
         assert [row["frame_index"] for row in own] == sorted({*range(0, 23, every), 23})
         assert (own[0]["progress"], own[-1]["progress"]) == (0.0, pytest.approx(1.0, abs=1e-5))
-    assert "held-out episodes (1: always)" in capsys.readouterr().out
+    assert "held-out episodes (1 is best)" in capsys.readouterr().out
