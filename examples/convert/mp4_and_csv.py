@@ -196,9 +196,8 @@ def match_rows(path: Path, row_times: np.ndarray, times: np.ndarray) -> tuple[np
         return np.arange(len(times)), row_times - row_times[0]
     rows = find_nearest(row_times, times)
     if (farthest := abs(row_times[rows] - times).max()) > MAX_ROW_DISTANCE_S:
-        raise SystemExit(
-            f"{path}: a frame is {farthest:.2f} s from the nearest row. Expected at most {MAX_ROW_DISTANCE_S} s. Set `time` to 0 at the first frame."
-        )
+        problem = f"{path}: a frame is {farthest:.2f} s from the nearest row"
+        raise SystemExit(f"{problem}. Expected at most {MAX_ROW_DISTANCE_S} s. Set `time` to 0 at the first frame.")
     return rows, times
 
 

@@ -3,9 +3,9 @@
     python examples/judge/progress.py RUN progress.parquet [EVERY]
 
 Progress is 1 - d / d0, where d is the latent distance of a frame to the last frame and d0 that of the first frame. It
-is 0 at the start of an episode and 1 at its end. The table has a row for every EVERY-th frame (default 1) and the last. episode_index and frame_index are
-LeRobot's; for other formats, episode_index is the position in the data set's index. Spearman's correlation with
-time on held-out episodes measures how steadily progress grows.
+is 0 at the start of an episode and 1 at its end. The table has a row for every EVERY-th frame (default 1) and the
+last. episode_index and frame_index are LeRobot's; for other formats, episode_index is the position in the data set's
+index. Spearman's correlation with time on held-out episodes measures how steadily progress grows.
 """
 
 import sys
@@ -54,9 +54,8 @@ def main(run: str, out: str, every: str = "1") -> None:
     pyarrow.parquet.write_table(pa.Table.from_pylist(rows), out)
     if correlations:
         correlation = estimate_mean(np.array(list(correlations.values())), list(correlations))
-        print(
-            f"Spearman correlation of progress with time: {correlation} on {len(correlations)} held-out episodes (1 is best)."
-        )
+        count = f"{len(correlations)} held-out episodes"
+        print(f"Spearman correlation of progress with time: {correlation} on {count} (1 is best).")
 
 
 if __name__ == "__main__":
