@@ -158,8 +158,8 @@ class LeRobotWriter:
             "task_index": np.full_like(order, self._tasks.get(task, len(self._tasks))),
         }
         for name, values in columns.items():
-            about = {"dtype": str(values.dtype), "shape": [values.shape[1]], "names": self._names.get(name)}
-            self._features.setdefault(name, about)
+            description = {"dtype": str(values.dtype), "shape": [values.shape[1]], "names": self._names.get(name)}
+            self._features.setdefault(name, description)
         statistics = {name: compute_statistics(values) for name, values in columns.items()}
         row = {"episode_index": number, "tasks": [task], "length": steps, **_file_indices("data", 0, 0)}
         row |= {"dataset_from_index": start, "dataset_to_index": start + steps}

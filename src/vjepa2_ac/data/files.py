@@ -104,12 +104,12 @@ def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
     """
     folders, visited = [""], {storage.canonical_path(root)}
     for _ in range(DEEPEST):
-        below: list[str] = []
-        listed = map_in_threads(lambda folder: list_folder(root, folder), folders, connections)
-        for folder, (files, names) in zip(folders, listed, strict=True):
+        subfolders: list[str] = []
+        listings = map_in_threads(lambda folder: list_folder(root, folder), folders, connections)
+        for folder, (files, names) in zip(folders, listings, strict=True):
             yield from ((folder, file) for file in files if not file.name.startswith("."))
-            below += [storage.join(folder, name) for name in names]
-        paths = {storage.canonical_path(storage.join(root, folder)): folder for folder in reversed(below)}
+            subfolders += [storage.join(folder, name) for name in names]
+        paths = {storage.canonical_path(storage.join(root, folder)): folder for folder in reversed(subfolders)}
         folders = sorted(folder for path, folder in paths.items() if path not in visited)
         visited |= paths.keys()
 

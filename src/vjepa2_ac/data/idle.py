@@ -83,8 +83,8 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     fix = "Use the list for this version of the data set, or set data.idle.rule: commands or motion"
     ranges_by_identity = read_json_object(path, max_bytes=_MOST_BYTES, needed=needed)
     names = [table.identity(index) for index in range(len(table))]
-    listed = sum(name in ranges_by_identity for name in names)
-    if not listed:
+    num_listed = sum(name in ranges_by_identity for name in names)
+    if not num_listed:
         first = next(iter(ranges_by_identity), "missing")
         problem = (
             f"the list has none of the {counted(len(table), 'episode')} of the data set. Its first entry is {first}"
@@ -101,9 +101,9 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
             )
         ranges.append(pairs)
     logger.log(
-        logging.INFO if listed == len(table) else logging.WARNING,
+        logging.INFO if num_listed == len(table) else logging.WARNING,
         "%s: lists %d of the %d episodes; the other %d are treated as idle",
-        path, listed, len(table), len(table) - listed,
+        path, num_listed, len(table), len(table) - num_listed,
     )  # fmt: skip
     return StepSelection.from_ranges(ranges)
 

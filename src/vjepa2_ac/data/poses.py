@@ -114,8 +114,8 @@ def require_selection(
     count = width = sum(columns.values())
     if fields.select is not None:
         where, count = f"{section_path}.select", len(fields.select)
-        if beyond := [number for number in fields.select if number >= width]:
-            problem = f"index {beyond[0]}, but {source} has {counted(width, 'number')}"
+        if invalid_indices := [number for number in fields.select if number >= width]:
+            problem = f"index {invalid_indices[0]}, but {source} has {counted(width, 'number')}"
             raise InputError(where=where, found=problem, needed=f"indices from 0 to {width - 1}")
     rotation_width = num_rotation_numbers(fields.rotation)
     if is_pose and count != 4 + rotation_width:

@@ -128,8 +128,8 @@ class BrokenEpisodes:
             return
         names = [problem.name for problem in problems]
         if self._config.broken_episodes == "error":
-            first, more = problems[0], len(problems) - 1
-            more_problems = f"{counted(more, 'more episode')} cannot be used either. " if more else ""
+            first, num_more = problems[0], len(problems) - 1
+            more_problems = f"{counted(num_more, 'more episode')} cannot be used either. " if num_more else ""
             raise self.add_fix(replace(first, fix=more_problems + first.fix).error, names)
         logger.warning(
             "%s: %d of %d episodes are broken and skipped: %s. First error: %s",
@@ -174,8 +174,8 @@ class BrokenEpisodes:
         return add_exclusion_fix(error, names, is_skippable=is_few and self._config.broken_episodes == "error")
 
     def _add(self, reasons: Mapping[str, str]) -> None:
-        new = {name: reason for name, reason in reasons.items() if name not in self.reasons}
-        self.reasons = {**self.reasons, **new}  # a new dict, because a checkpoint may be writing the old one
+        new_reasons = {name: reason for name, reason in reasons.items() if name not in self.reasons}
+        self.reasons = {**self.reasons, **new_reasons}  # a new dict, because a checkpoint may be writing the old one
         if len(self) <= (allowed := max_broken(self._episodes)):
             return
         name, reason = next(iter(self.reasons.items()))
@@ -194,17 +194,17 @@ def add_exclusion_fix(error: InputError, names: Sequence[str], *, is_skippable: 
         is_skippable: Whether `data.broken_episodes: skip` would leave them out.
     """
     fix = f"{error.fix.rstrip('.')}. " if error.fix else ""
-    listed = json.dumps(names[:MAX_NAMED], ensure_ascii=False)
+    listing = json.dumps(names[:MAX_NAMED], ensure_ascii=False)
     of_all = f" (the first {MAX_NAMED} of {len(names)})" if len(names) > MAX_NAMED else ""
     skip = "set data.broken_episodes: skip, or " if is_skippable else ""
-    fix = f"{fix}To leave {'it' if len(names) == 1 else 'them'} out, {skip}add{of_all} to data.exclude: {listed}"
+    fix = f"{fix}To leave {'it' if len(names) == 1 else 'them'} out, {skip}add{of_all} to data.exclude: {listing}"
     return InputError(where=error.where, found=error.found, needed=error.needed, fix=fix)
 
 
 def format_identities(ids: Sequence[str], count: int | None = None) -> str:
     """Return identities for a message: the first ten, and the number of the rest (of `count` in total)."""
-    more = (len(ids) if count is None else count) - MAX_NAMED
-    return ", ".join(ids[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
+    num_more = (len(ids) if count is None else count) - MAX_NAMED
+    return ", ".join(ids[:MAX_NAMED]) + (f" and {num_more} more" if num_more > 0 else "")
 
 
 # ---- splits ----
@@ -242,13 +242,13 @@ def describe_splits(table: EpisodeTable, config: DataConfig) -> str:
     if labels is None:
         return ""
     counts = np.bincount(labels.number[labels.number >= 0], minlength=len(labels.names)).tolist()
-    listed = [f"{name} ({counted(count, 'episode')})" for name, count in zip(labels.names, counts, strict=True)]
+    listing = [f"{name} ({counted(count, 'episode')})" for name, count in zip(labels.names, counts, strict=True)]
     if not (held_out := held_out_splits(table, config)):
         reason = (
             "data.splits is hash" if config.splits == "hash" else "they do not include both train and a held-out split"
         )
-        return f"drawn by hash; the data set's own splits are not used because {reason}: {', '.join(listed)}"
-    roles = zip(listed, map_split_roles(labels.names).items(), strict=True)
+        return f"drawn by hash; the data set's own splits are not used because {reason}: {', '.join(listing)}"
+    roles = zip(listing, map_split_roles(labels.names).items(), strict=True)
     used = ", ".join(text if name == role else f"{text} as {role}" for text, (name, role) in roles)
     drawn = next((f"; {split} is drawn from train by hash" for split in _HELD_OUT if split not in held_out), "")
     return f"the data set's own: {used}{drawn}"

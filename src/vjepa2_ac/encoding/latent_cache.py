@@ -209,8 +209,8 @@ class LatentCache:
             return open_cached_latents(self.dataset, self.folder)
         parent, other_caches = str(self.folder).rpartition("/")[0], []
         for name in storage.list_names(parent):
-            if storage.exists(storage.join(other := storage.join(parent, name), CACHE_FILE)):
-                differing = read_cache_key(other).list_differences(self.key.parts)
+            if storage.exists(storage.join(other_folder := storage.join(parent, name), CACHE_FILE)):
+                differing = read_cache_key(other_folder).list_differences(self.key.parts)
                 other_caches.append((len(differing), f"{name}, which differs: {'; '.join(differing)}"))
         nearest = (
             f". Number of other caches in its folder: {len(other_caches)}. Most similar: {min(other_caches)[1]}"

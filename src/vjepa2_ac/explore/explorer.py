@@ -404,11 +404,11 @@ class Search:
             InputError: The config has no limits of actions.
             SearchCancelledError: The computation was cancelled.
         """
-        around = torch.tensor([list(action)], dtype=torch.float32)
+        center_action = torch.tensor([list(action)], dtype=torch.float32)
         with self._open_cost(model_index, position, goal) as cost:
             checked_progress = raise_if_cancelled(cancelled, progress)
             return compute_energy_slices(
-                cost, around, self.make_search_space(), self.axes, nodes=_GRID_POINTS, progress=checked_progress
+                cost, center_action, self.make_search_space(), self.axes, nodes=_GRID_POINTS, progress=checked_progress
             )
 
     def plan(

@@ -363,15 +363,17 @@ def encode_message(kind: str, seq: int | None, values: dict[str, Any], images: S
         images: The images after the header.
     """
     jpegs = [encode_jpeg(image.pixels, quality=_QUALITY) for image in images]
-    about = [
+    image_headers = [
         {"name": image.name, "bytes": len(data), "alt": image.alt} for image, data in zip(images, jpegs, strict=True)
     ]
-    text = json.dumps(to_plain({"kind": kind, "seq": seq, "images": about, **values}), allow_nan=False).encode()
+    text = json.dumps(to_plain({"kind": kind, "seq": seq, "images": image_headers, **values}), allow_nan=False).encode()
     return b"".join([len(text).to_bytes(4, "big"), text, *jpegs])
 
 
 def make_displayed_units(space: Space) -> list[dict[str, Any]]:
     """Return the name, unit, displayed unit and conversion factor of each number of a state or an action."""
-    shown = {"m": ("cm", 100.0), "rad": ("°", 180 / math.pi)}
-    units = [(name, unit, *shown.get(unit, (unit, 1.0))) for name, unit in zip(space.names, space.units, strict=True)]
+    display_units = {"m": ("cm", 100.0), "rad": ("°", 180 / math.pi)}
+    units = [
+        (name, unit, *display_units.get(unit, (unit, 1.0))) for name, unit in zip(space.names, space.units, strict=True)
+    ]
     return [dict(zip(("name", "unit", "display_unit", "factor"), values, strict=True)) for values in units]

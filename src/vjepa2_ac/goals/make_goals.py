@@ -63,9 +63,9 @@ class DemonstrationGoals:
         Raises:
             InputError: The folder cannot be written.
         """
-        about = {"by": self.options.by, "every": self.options.every, "stride": self.options.stride}
-        made = {"frames": self.frames, "version": __version__, "time": utc_now()}
-        origin = {**self.origin, **about, **made}
+        selection = {"by": self.options.by, "every": self.options.every, "stride": self.options.stride}
+        creation = {"frames": self.frames, "version": __version__, "time": utc_now()}
+        origin = {**self.origin, **selection, **creation}
         return write_goals(folder, self.goals, frames=[key.frame for key in self.keys], origin=origin)
 
 

@@ -278,11 +278,11 @@ def _is_not_measured(candidate: _Numbers) -> bool:
 def _list_unused(chosen: _Numbers, numbers: Sequence[_Number]) -> list[str]:
     """Return the names of the unused numbers of other arms, of commands, and of the same columns."""
     columns, group = {number.column for number in chosen}, chosen[0].group
-    rest = [
+    remaining = [
         number for number in numbers if number not in chosen and (number.group != group or number.column in columns)
     ]
-    groups = {number.group for number in rest if number.kind == "position"}
-    unused = [number for number in rest if number.group in groups]
+    groups = {number.group for number in remaining if number.kind == "position"}
+    unused = [number for number in remaining if number.group in groups]
     return [number.name if number.column in columns else f"{number.column}: {number.name}" for number in unused]
 
 

@@ -62,8 +62,8 @@ def read_npz_properties(path: str) -> DatasetProperties:
     Raises:
         InputError: There are no .npz files, or the first one has no states, no rate or no frames.
     """
-    listed = [storage.join(folder, file.name) for folder, file in walk(path, _CONNECTIONS)]
-    files = sorted(name for name in listed if name.endswith(".npz"))
+    paths = (storage.join(folder, file.name) for folder, file in walk(path, _CONNECTIONS))
+    files = sorted(name for name in paths if name.endswith(".npz"))
     if not files:
         raise InputError(where=path, found="no .npz files", needed="one .npz file per episode", fix=FORMAT_HELP)
     where = storage.join(path, files[0])
@@ -209,9 +209,9 @@ def _find_described_sets(path: str) -> list[tuple[str, str]]:
     described: dict[str, tuple[str, str]] = {}  # by absolute path, because several links may lead to one data set
     folders = [path]
     for depth in range(_DEEPEST + 2):
-        listed = zip(folders, map_in_threads(storage.list_folder, folders, _CONNECTIONS), strict=True)
+        listings = zip(folders, map_in_threads(storage.list_folder, folders, _CONNECTIONS), strict=True)
         folders = []
-        for folder, entries in listed:
+        for folder, entries in listings:
             names = {entry.name for entry in entries}
             marked = [form for form, mark in _DESCRIPTION_FILES.items() if mark.partition("/")[0] in names]
             if form := next(
@@ -219,10 +219,10 @@ def _find_described_sets(path: str) -> list[tuple[str, str]]:
             ):
                 described.setdefault(storage.canonical_path(folder), (form, folder))
                 continue
-            inner = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
+            subfolders = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
             if depth == _DEEPEST:
-                inner = [name for name in inner if _VERSION.fullmatch(name)]
-            folders += [storage.join(folder, name) for name in sorted(inner, key=_as_version)[-_MOST_FOLDERS:]]
+                subfolders = [name for name in subfolders if _VERSION.fullmatch(name)]
+            folders += [storage.join(folder, name) for name in sorted(subfolders, key=_as_version)[-_MOST_FOLDERS:]]
     return list(described.values())
 
 
@@ -279,10 +279,10 @@ def _names_below(path: str) -> list[str]:
     for _ in range(5):
         names_in_folder = storage.list_names(path)
         names += names_in_folder
-        inner = next((name for name in sorted(names_in_folder) if "." not in name), None)
-        if inner is None:
+        subfolder = next((name for name in sorted(names_in_folder) if "." not in name), None)
+        if subfolder is None:
             break
-        path = storage.join(path, inner)
+        path = storage.join(path, subfolder)
     return names
 
 

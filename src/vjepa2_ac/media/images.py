@@ -121,11 +121,11 @@ def stack_frames(
     """
     stacked: list[UInt8[np.ndarray, "height width 3"]] = []
     for frame, step in zip(frames, steps, strict=True):
-        at = f"{where}: step {step}"
-        require_decodable_size(frame.shape[0], frame.shape[1], at, count=len(steps))
+        step_where = f"{where}: step {step}"
+        require_decodable_size(frame.shape[0], frame.shape[1], step_where, count=len(steps))
         if stacked and frame.shape != stacked[0].shape:
             problem, needed = (f"an image of {image.shape[0]}x{image.shape[1]}" for image in (frame, stacked[0]))
-            raise InputError(where=at, found=problem, needed=f"{needed}, as at step {steps[0]}")
+            raise InputError(where=step_where, found=problem, needed=f"{needed}, as at step {steps[0]}")
         stacked.append(frame)
     return np.stack(stacked) if stacked else np.zeros((0, 0, 0, 3), np.uint8)
 

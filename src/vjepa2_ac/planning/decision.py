@@ -181,7 +181,7 @@ def write_plan(result: PlanResult, about: Mapping[str, Any], path: Path) -> Path
 
 def summarize(result: PlanResult) -> str:
     """Return the decision as one or more sentences."""
-    plan, why, now = result.decision.plan, result.decision.why, result.decision.current_energy
+    plan, why, current_energy = result.decision.plan, result.decision.why, result.decision.current_energy
     if why == "outside the workspace":
         return (
             "Zero action: the robot is farther outside planning.limits.workspace than one action can correct. Move the"
@@ -198,7 +198,8 @@ def summarize(result: PlanResult) -> str:
     effort = f"{counted(plan.evaluations, 'action sequence')} in {counted(iterations, 'iteration')}"
     sentences = [
         _describe_motion(result),
-        f"Energy {now:.4f} now, {plan.energy:.4f} predicted for the plan{_relative_change(plan.energy, now)},",
+        f"Energy {current_energy:.4f} now,",
+        f"{plan.energy:.4f} predicted for the plan{_relative_change(plan.energy, current_energy)},",
         f"{result.zero_action_energy:.4f} predicted for the zero action.",
         f"Planner {plan.planner}, seed {plan.seed}: {effort}, {result.seconds['decision']:.2f} s.",
     ]
@@ -218,18 +219,18 @@ def _relative_change(energy: float, reference: float) -> str:
 
 def _describe_motion(result: PlanResult) -> str:
     space, change, steps = result.state_space, result.states[-1] - result.states[0], len(result.actions)
-    shown = change[list(result.controller.display_axes)] * (space.display_factor if space.is_pose else 1.0)
+    displayed = change[list(result.controller.display_axes)] * (space.display_factor if space.is_pose else 1.0)
     names = [space.change_names[axis] for axis in result.controller.display_axes]
     duration = f"in {counted(steps, 'model step')}"
     if not space.is_pose:
-        parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, shown, strict=True))
+        parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, displayed, strict=True))
         more = ", ..." if len(result.space.free) > len(names) else ""
         return f"Changes {parts}{more} {duration}."
-    parts = ", ".join(f"{name} {value:+.1f}" for name, value in zip(names, shown, strict=True))
+    parts = ", ".join(f"{name} {value:+.1f}" for name, value in zip(names, displayed, strict=True))
     gripper = 0.0 if space.gripper is None else change[space.gripper]
     gripper_text = f", gripper {gripper:+.2f}" if gripper else ""
     unit = space.display_unit
-    return f"Moves {np.linalg.norm(shown):.1f} {unit} {duration} ({parts} {unit}{gripper_text})."
+    return f"Moves {np.linalg.norm(displayed):.1f} {unit} {duration} ({parts} {unit}{gripper_text})."
 
 
 def find_axes_at_limit(result: PlanResult) -> list[str]:

@@ -124,12 +124,12 @@ class GoalProgress:
         goal, steps, unchanged = goals[self.goal_index], step - self.start_step, replace(self, changed="")
         if self.is_done or steps < goal.at_least:
             return unchanged
-        now, is_last = energy(self.goal_index), self.goal_index == len(goals) - 1
-        why = goal.explain_reached(now, self.initial_energy)
+        current_energy, is_last = energy(self.goal_index), self.goal_index == len(goals) - 1
+        why = goal.explain_reached(current_energy, self.initial_energy)
         if not why and goal.at_most is not None and steps >= goal.at_most and not is_last:
-            why = f"the limit of {counted(goal.at_most, 'step')} is reached, at energy {now:.4g}"
-            if self.initial_energy > 0 and math.isfinite(now):
-                why += f", {now / self.initial_energy:.0%} of {self.initial_energy:.4g}"
+            why = f"the limit of {counted(goal.at_most, 'step')} is reached, at energy {current_energy:.4g}"
+            if self.initial_energy > 0 and math.isfinite(current_energy):
+                why += f", {current_energy / self.initial_energy:.0%} of {self.initial_energy:.4g}"
         if not why:
             return unchanged
         name = f"Goal {self.goal_index + 1} ({goal.name})" if goal.name else f"Goal {self.goal_index + 1}"

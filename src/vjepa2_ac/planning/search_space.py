@@ -217,9 +217,9 @@ def _shorten_to_l1(
     """
     if l1 is None:
         return motion
-    beyond = motion - shortest
-    allowed, length = l1 - abs(shortest).sum(), abs(beyond).sum()
-    return np.asarray(shortest + beyond * min(1.0, max(allowed, 0.0) / max(length, _NEAR_M)))
+    remaining = motion - shortest
+    allowed, length = l1 - abs(shortest).sum(), abs(remaining).sum()
+    return np.asarray(shortest + remaining * min(1.0, max(allowed, 0.0) / max(length, _NEAR_M)))
 
 
 def is_within_limits(motion: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:

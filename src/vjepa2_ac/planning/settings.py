@@ -227,16 +227,16 @@ def warn_if_limits_exceed_data(config: Config, folder: Path) -> tuple[str, ...]:
     names = POSE.change_names if is_pose else make_vector_states(len(data_limits.changes)).names
     reach = _largest_changes(config.planning.limits, data_limits, is_pose=is_pose)
     for key, (unit, factor, numbers) in (_POSE_LIMITS if is_pose else _VECTOR_LIMITS).items():
-        beyond = [
+        exceeded = [
             f"{name} {factor * limit:.3g} ({factor * change:.3g}){unit}"
             for name, limit, change in list(zip(names, reach, data_limits.changes, strict=False))[numbers]
             if limit > _SLACK * change
         ]
-        if beyond:
-            name = f"planning.limits.{key}"
+        if exceeded:
+            name, listing = f"planning.limits.{key}", ", ".join(exceeded)
             fix = f"Set {name}=data" if key in {"xyz", "axes"} else f"Lower {name}"
             warnings.append(
-                f"{name} exceeds the motions in the training data of {folder}: {', '.join(beyond)} (99th percentile of"
+                f"{name} exceeds the motions in the training data of {folder}: {listing} (99th percentile of"
                 f" the data in parentheses). Predictions for larger motions are unreliable. {fix}"
             )
     for text in warnings:

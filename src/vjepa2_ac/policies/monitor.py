@@ -124,8 +124,8 @@ class EpisodeErrors:
 
     def find_first_alarm(self, monitor: Monitor) -> int | None:
         """Return the index of the first step whose surprise is above the threshold; None: there is none."""
-        above = np.flatnonzero(~(self.compute_scores(monitor.expected) <= monitor.threshold))
-        return int(above[0]) if len(above) else None
+        alarms = np.flatnonzero(~(self.compute_scores(monitor.expected) <= monitor.threshold))
+        return int(alarms[0]) if len(alarms) else None
 
 
 @torch.no_grad()

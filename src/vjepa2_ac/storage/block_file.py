@@ -228,8 +228,8 @@ class DiskCache:
 
     def _entries(self) -> Iterator[tuple[int, int, str]]:
         """Yield last use, size and path of every entry, and of partial files left behind by killed writers."""
-        for inner in [entry.path for entry in os.scandir(self._folder) if entry.is_dir()]:
-            for entry in os.scandir(inner):
+        for subfolder in [entry.path for entry in os.scandir(self._folder) if entry.is_dir()]:
+            for entry in os.scandir(subfolder):
                 with suppress(FileNotFoundError):  # renamed meanwhile
                     stat = entry.stat()
                     yield stat.st_mtime_ns, stat.st_size, entry.path
@@ -260,7 +260,10 @@ class BlockCachedFile(RangedFile):
 
     def _fetch_blocks(self, start: int, length: int) -> bytes:
         """Return the bytes of whole blocks from the disk cache or the URL."""
-        blocks = [(at, min(BLOCK_BYTES, self._bytes - at)) for at in range(start, start + length, BLOCK_BYTES)]
+        blocks = [
+            (block_start, min(BLOCK_BYTES, self._bytes - block_start))
+            for block_start in range(start, start + length, BLOCK_BYTES)
+        ]
         try:
             return b"".join(cached_ranges(self._path, blocks, key=self._key, cache=self._cache))
         except Exception as error:

@@ -414,8 +414,8 @@ def _new_partial(parent: Path, name: str) -> Path:
     """Return a temporary path in `parent` for a file or folder that will be renamed to `name`; create `parent`."""
     parent.mkdir(parents=True, exist_ok=True)
     remove_abandoned(parent.absolute())
-    short = name.encode(errors="surrogateescape")[:_NAME_BYTES].decode(errors="ignore")
-    return parent / f".{short}.{secrets.token_hex(4)}.partial"
+    short_name = name.encode(errors="surrogateescape")[:_NAME_BYTES].decode(errors="ignore")
+    return parent / f".{short_name}.{secrets.token_hex(4)}.partial"
 
 
 @functools.cache

@@ -27,9 +27,9 @@ def is_url(path: str | Path) -> bool:
     return "://" in str(path)
 
 
-def parse_folder(place: str) -> Path | str:
+def parse_folder(path: str) -> Path | str:
     """Return a local folder (also `file://`) as a Path, or a remote folder as its URL."""
-    local = place.removeprefix("file://")
+    local = path.removeprefix("file://")
     return local if is_url(local) else Path(local)
 
 

@@ -99,10 +99,10 @@ def list_folder(url: str) -> list[FileInfo]:
         UnreachableError: The URL cannot be reached.
     """
     try:
-        listed = _retry(url, lambda timeout_s: _call_method(url, "ls", timeout_s, detail=True, refresh=True))
+        listing = _retry(url, lambda timeout_s: _call_method(url, "ls", timeout_s, detail=True, refresh=True))
     except FileNotFoundError:
         return []
-    entries = {str(entry["name"]).rstrip("/").rsplit("/", 1)[-1]: entry for entry in listed}
+    entries = {str(entry["name"]).rstrip("/").rsplit("/", 1)[-1]: entry for entry in listing}
     return [
         FileInfo(name, int(entry.get("size") or 0), _version_of(entry), entry["type"] == "file")
         for name, entry in sorted(entries.items())

@@ -110,15 +110,15 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             needed = f"folders LAB/success|failure/DATE/TIME with a {TRAJECTORY}"
             fix = "The raw DROID recordings are in gs://gresearch/robotics/droid_raw/1.0.1"
             raise InputError(where="data.path", found=f"no episodes under {root}", needed=needed, fix=fix)
-        listed: Sequence[EpisodeFolder | str] = folders
+        episode_files: Sequence[EpisodeFolder | str] = folders
         if not storage.is_url(root):
-            listed = [list_episode(root, folder) for folder in folders]
+            episode_files = [list_episode(root, folder) for folder in folders]
         parts = {
             "source": "droid_raw",
             "cameras": config.cameras,
             **config.format_values,
             "pose_frame": config.pose_frame,
-            "folders": listed,
+            "folders": episode_files,
         }
         key = index_key(parts, root, identity=get_identity(root, folders[0]))
         identities = {folder: get_identity(root, folder) for folder in folders}
@@ -127,13 +127,13 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
 
     def _scan(self, folder: str) -> IndexEntry:
         identity = get_identity(self._config.path, folder)
-        listed = list_episode(self._config.path, folder)
-        has_trajectory = any(file.name == TRAJECTORY for file in listed.files)
-        if not has_trajectory or listed.metadata is None:
+        episode_files = list_episode(self._config.path, folder)
+        has_trajectory = any(file.name == TRAJECTORY for file in episode_files.files)
+        if not has_trajectory or episode_files.metadata is None:
             file = "metadata_*.json" if has_trajectory else TRAJECTORY
             problem, needed = f"episode {identity} has no {file}", f"a {file} in each episode"
             raise InputError(where=self._path(folder, ""), found=problem, needed=needed, fix=_FIX)
-        version, path = hash_key({"files": listed}), self._path(folder, listed.metadata)
+        version, path = hash_key({"files": episode_files}), self._path(folder, episode_files.metadata)
         metadata = parse_json_object(
             self._files.read(path, version=version), where=path, needed="the metadata of an episode"
         )
@@ -143,10 +143,10 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         counts = {}
         for serial in serials:
             video = self._path(folder, f"{VIDEOS}/{serial}.mp4")
-            names = [file.name for file in listed.videos]
+            names = [file.name for file in episode_files.videos]
             if f"{serial}.mp4" not in names:
                 problem = f"no such file; existing MP4 files: {', '.join(names) or 'none'}"
-                needed = f"the MP4 of a camera in {listed.metadata} or data.camera"
+                needed = f"the MP4 of a camera in {episode_files.metadata} or data.camera"
                 fix = f"{did_you_mean(serial, [*RAW_CAMERAS, *serial_by_camera.values()])}{_FIX}"
                 raise InputError(where=video, found=problem, needed=needed, fix=fix)
             counts[serial] = read_header(video, where=video).num_frames

@@ -119,7 +119,7 @@ def require_matching_folder(folder: Path | str, name: str, key: CacheKey, *, whe
     """
     fix = "Choose another folder, or delete this one"
     # Listed before the key is read, because another process may start writing at any time.
-    other_names = [other for other in storage.list_names(folder) if other[0] != "."]
+    other_names = [other_name for other_name in storage.list_names(folder) if other_name[0] != "."]
     try:
         stored = read_json_object(storage.join(folder, name), fix=fix)
     except MissingFileError:
@@ -137,8 +137,8 @@ def _compare_values(name: str, stored: Any, current: Any) -> list[str]:
     if stored == current or (current is None and name in REMOVED and stored in REMOVED[name].values):
         return []  # equal, or the key of a removed option whose stored value equals today's behaviour
     if isinstance(stored, dict) and isinstance(current, dict):
-        inner = sorted(stored.keys() | current)
-        return [text for key in inner for text in _compare_values(f"{name}.{key}", stored.get(key), current.get(key))]
+        keys = sorted(stored.keys() | current)
+        return [text for key in keys for text in _compare_values(f"{name}.{key}", stored.get(key), current.get(key))]
     return [f"{name}: {_format_value(stored)}, not {_format_value(current)}"]
 
 

@@ -109,12 +109,12 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         keys = [info.get_camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
             import_pyav(info.where)
-        listed = partial(list_by_template, info.root, connections=num_connections(config))
-        tables, files = listed(TABLES[info.version]), listed(info.data_path)
+        list_files = partial(list_by_template, info.root, connections=num_connections(config))
+        tables, files = list_files(TABLES[info.version]), list_files(info.data_path)
         num_bytes = sum(file.size for file in files.values())
         for key in keys:
             if info.features[key].dtype == "video":
-                files |= listed(info.video_path or "", key)
+                files |= list_files(info.video_path or "", key)
         fields = config.format_values["lerobot"]
         fields.pop("action")  # `select_columns` includes the columns of actions if they are read
         parts = {

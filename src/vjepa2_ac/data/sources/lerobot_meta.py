@@ -222,8 +222,8 @@ def _parse_feature(content: Mapping[str, Any]) -> Feature:
 
 def _require_safe_template(template: str) -> str:
     """Check a path template such as `chunk-{chunk_index:03d}`, which must stay inside the data set, and return it."""
-    rest = _PLACEHOLDER.sub("", template)
-    if not template or template.startswith("/") or ".." in template.split("/") or "{" in rest or "}" in rest:
+    has_other_fields = re.search("[{}]", _PLACEHOLDER.sub("", template)) is not None
+    if not template or template.startswith("/") or ".." in template.split("/") or has_other_fields:
         raise ValueError(f"invalid path template {template!r}")
     return template
 

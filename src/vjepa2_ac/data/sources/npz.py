@@ -139,19 +139,19 @@ class NpzSource(IndexedSource[DataConfig, None]):
     def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, None]:
         """Return the cached table, or read all episodes; a changed file changes the key."""
         config, root = self._config, self._config.path
-        listed = sorted(
+        file_entries = sorted(
             (storage.join(folder, file.name), file.size, file.version)
             for folder, file in walk(root, CONNECTIONS)
             if file.name.endswith(_SUFFIX)
         )
-        if not listed:
+        if not file_entries:
             problem = f"no .npz files under {root}"
             raise InputError(where="data.path", found=problem, needed="one .npz file for each episode", fix=FORMAT_HELP)
         config_values: dict[str, object] = {"cameras": config.cameras, "pose_frame": config.pose_frame}
         if config.states == "vector":
             config_values |= {"states": config.states, "actions": config.actions}
-        key = index_key({"source": "npz", **config_values, "listed": listed}, root)
-        ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
+        key = index_key({"source": "npz", **config_values, "listed": file_entries}, root)
+        ids = [path.removesuffix(_SUFFIX) for path, _, _ in file_entries]
         build = partial(self._scan_all, partial(self._scan, key), dict(zip(ids, ids, strict=True)), progress)
         return get_or_build_index(config.disk_cache, key, root, build), None
 

@@ -53,13 +53,13 @@ def find_shards(folder: str) -> list[Shard]:
             where=where, found=f"fileFormat {form}", needed="tfrecord", fix="Convert the data set with TFDS"
         )
     try:
-        listed = [shard for split in info["splits"] for shard in _list_shards(split, str(info["name"]))]
+        expected_shards = [shard for split in info["splits"] for shard in _list_shards(split, str(info["name"]))]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         problem = f"not a valid data set description ({error!r})"
         raise InputError(where=where, found=problem, needed=f"a {_INFO} as written by TFDS") from None
-    if not listed:
+    if not expected_shards:
         raise InputError(where=where, found="no episodes in any split", needed="a data set with episodes")
-    names = [name for name, *_ in listed]
+    names = [name for name, *_ in expected_shards]
     present = {file.name: file for file in storage.list_files(folder)}
     if missing := [name for name in names if name not in present]:
         problem = f"{len(missing)} of {len(names)} shards are missing: {format_identities(missing)}"
@@ -67,7 +67,7 @@ def find_shards(folder: str) -> list[Shard]:
         raise InputError(where=folder, found=problem, needed=f"every shard that {_INFO} lists", fix=fix)
     return [
         Shard(storage.join(folder, name), count, present[name].size, present[name].version, split)
-        for name, count, split in listed
+        for name, count, split in expected_shards
     ]
 
 
