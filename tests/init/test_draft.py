@@ -82,6 +82,11 @@ def test_line_breaks_in_names_cannot_add_config_keys(between: str) -> None:
     assert parse_config(parse_yaml(config_as_yaml(read), where="run"), where="run") == read
 
 
+def test_share_of_a_single_episode_is_exact() -> None:
+    config_text = make(replace(PROPERTIES, episodes=1)).to_yaml(PROPERTIES, MACHINE)
+    assert "# 1 of 1 episode, selected by a hash" in config_text
+
+
 def test_batch_size_without_gpu_is_for_an_assumed_gpu() -> None:
     made = make(machine=replace(MACHINE, gpu=None))
     assert made.config.training.batch_size == 4

@@ -57,6 +57,12 @@ def padded(number: int) -> Pair:
     return states, frames
 
 
+def with_black_first_frame(number: int) -> Pair:
+    states, frames = clean(number)
+    frames[0] = 0
+    return states, frames
+
+
 def joined(number: int) -> Pair:
     (first, one), (second, other) = clean(number), clean(100 + number)
     second[:, 0] += 0.4
@@ -126,6 +132,11 @@ def test_padding_is_named_with_its_steps_and_black_frames_are_counted(tmp_path: 
     assert warnings["speed"].startswith(fast)
     assert warnings["episode ends"].startswith("45 black and 0 frozen frames")
     assert re.search(r"Example: 00[135], the last 10 frames are black\.", warnings["episode ends"])
+
+
+def test_single_black_frame_is_described_in_the_singular(tmp_path: Path) -> None:
+    warnings = read_warnings(config_of(tmp_path / "set", with_black_first_frame))
+    assert re.search(r"Example: 00\d, the first frame is black\.", warnings["episode ends"])
 
 
 def test_speed_example_is_the_step_between_joined_recordings(tmp_path: Path) -> None:
