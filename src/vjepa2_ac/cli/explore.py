@@ -115,12 +115,12 @@ def _views(
     subject: str, data: Config | None, decoder: TrainedDecoder, options: argparse.Namespace, reporter: Reporter
 ) -> Views:
     from vjepa2_ac.evaluation.evaluate_run import load_models
-    from vjepa2_ac.evaluation.request import require_one_process, resolve_config
+    from vjepa2_ac.evaluation.request import require_single_process, resolve_config
     from vjepa2_ac.explore.explorer import open_explorer
     from vjepa2_ac.explore.views import Views
     from vjepa2_ac.simulation.counterfactual import SimulatedFutures
 
-    require_one_process()
+    require_single_process()
     request = cli.evaluation_options(options, data=data, out=Path())
     config = resolve_config(subject, request)
 

@@ -31,7 +31,7 @@ from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError, UserError, counted
 from vjepa2_ac.evaluation.evaluate_run import load_models
-from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, resolve_config
+from vjepa2_ac.evaluation.request import EvaluationOptions, require_single_process, resolve_config
 from vjepa2_ac.planning.controller import Decision
 from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, make_named_actions, read_actions
 from vjepa2_ac.planning.decision import PlanResult
@@ -86,7 +86,7 @@ def imagine_image(session: Subject, options: ImagineOptions, observation: ImageO
     Raises:
         InputError: Decoder, state or actions cannot be used.
     """
-    require_one_process()
+    require_single_process()
     model, config = session.world_model, session.config
     decoder = load_decoder(options.decoder)
     warnings = decoder.require_fit(model, config.data, subject=session.name)
@@ -161,7 +161,7 @@ def imagine_clip(
         InputError: Subject, data, decoder, clip or actions cannot be used.
     """
     decoder = load_decoder(options.decoder)
-    require_one_process()
+    require_single_process()
     config = resolve_config(subject, options.evaluation)
     config = config.model_copy(update={"data": config.data.model_copy(update={"frames": options.steps + 1})})
     accelerator = make_accelerator(config)

@@ -73,7 +73,7 @@ def _require_checkpoint(run: Path, checkpoint: str) -> None:
         select_checkpoint(run, checkpoint)  # raises, and lists the existing steps
 
 
-def require_one_process(environment: Mapping[str, str] = os.environ) -> None:
+def require_single_process(environment: Mapping[str, str] = os.environ) -> None:
     """Check that there is one process: several would each do all of the work and write the same files.
 
     Raises:

@@ -103,7 +103,7 @@ def make_rows(evaluation: Evaluation) -> list[Row]:
     rows = _Rows(evaluation)
     rows.add_errors()
     rows.add_distributions()
-    rows.add_one_steps()
+    rows.add_teacher_forced_rows()
     for model in evaluation.models.values():
         if model.ranking is not None:
             rows.add_ranking(model.name, model.ranking)
@@ -193,7 +193,7 @@ class _Rows(list[Row]):
         if evaluation.decoded is not None and evaluation.decoded.fvd:
             self.line(group, "decoded frames", "fvd.decoded", _without_intervals(evaluation.decoded.fvd), **style)
 
-    def add_one_steps(self) -> None:
+    def add_teacher_forced_rows(self) -> None:
         """Add teacher-forced errors of one step: with zero and shuffled actions, and for moving and idle steps."""
         group, moving = (
             "One-step L1 error relative to persistence, teacher-forced (ratio)",
