@@ -1,4 +1,4 @@
-"""Config errors: all are reported at once, also those hidden by other errors, and none that is wrong."""
+"""Config errors: all wrong values are reported at once, each with its key."""
 
 import re
 from typing import Any
@@ -11,8 +11,8 @@ from vjepa2_ac.errors import InputError
 MINIMAL = {"run_dir": "runs/x", "data": {"path": "d"}, "model": {"base": "b.pt"}}
 
 
-def complaints(*overrides: str, values: dict[str, Any] | None = None) -> list[str]:
-    """Return the lines of what is wrong."""
+def error_lines(*overrides: str, values: dict[str, Any] | None = None) -> list[str]:
+    """Return the lines of the error, one per wrong value."""
     with pytest.raises(InputError) as caught:
         parse_config(MINIMAL if values is None else values, overrides, where="here")
     return [line.strip() for line in str(caught.value).splitlines() if line.startswith("  ")]
@@ -20,7 +20,7 @@ def complaints(*overrides: str, values: dict[str, Any] | None = None) -> list[st
 
 def test_all_config_errors_are_reported_together_with_their_keys() -> None:
     values = {"data": {"path": "d", "strid": 4, "frames": 1}, "model": {"base": "b"}, "training": {"rank": 8}}
-    assert complaints("training.learning_rate=fast", "data.stride=0", values=values) == [
+    assert error_lines("training.learning_rate=fast", "data.stride=0", values=values) == [
         "run_dir: missing; it has no default",
         "data.frames: Input should be greater than or equal to 2 (found 1)",
         "data.stride: Input should be greater than or equal to 1, or Input should be 'auto' (found 0)",
@@ -31,31 +31,31 @@ def test_all_config_errors_are_reported_together_with_their_keys() -> None:
 
 
 def test_rules_between_values_are_checked_when_each_value_is_valid() -> None:
-    found = complaints("training.decay_steps=5", "data.validation_share=0.97")
-    assert any("nothing to train on" in line for line in found)
-    assert any("decay_steps is only for" in line for line in found)
-    assert "rollout_steps 16 needs data.frames" in complaints("training.rollout_steps=16")[0]
+    lines = error_lines("training.decay_steps=5", "data.validation_share=0.97")
+    assert any("nothing to train on" in line for line in lines)
+    assert any("decay_steps is only for" in line for line in lines)
+    assert "rollout_steps 16 needs data.frames" in error_lines("training.rollout_steps=16")[0]
 
 
 @pytest.mark.parametrize(
-    ("unknown", "meant"),
+    ("unknown", "suggestion"),
     [
         ("data.strid", "stride"),
         ("training.rank", "adapter.rank"),
         ("dat", "data"),
     ],
 )
-def test_unknown_key_error_suggests_the_closest_key(unknown: str, meant: str) -> None:
-    assert complaints(f"{unknown}=1") == [f"{unknown}: unknown key; did you mean {meant}?"]
+def test_unknown_key_error_suggests_the_closest_key(unknown: str, suggestion: str) -> None:
+    assert error_lines(f"{unknown}=1") == [f"{unknown}: unknown key; did you mean {suggestion}?"]
 
 
 def test_mistyped_camera_gets_a_suggestion() -> None:
-    (line,) = complaints("data.camera=wrist_lef")
+    (line,) = error_lines("data.camera=wrist_lef")
     assert re.search(r"has no camera wrist_lef\. Did you mean wrist_left\? Available: .*exterior_1_left", line)
 
 
 def test_unknown_key_error_lists_existing_keys_without_a_close_match() -> None:
-    (line,) = complaints("tracking.zzz=1")
+    (line,) = error_lines("tracking.zzz=1")
     assert re.search(r"known here: tensorboard, wandb", line)
 
 
@@ -72,6 +72,6 @@ def test_unknown_key_error_lists_existing_keys_without_a_close_match() -> None:
         ("data.fields.cameras=3", "data.fields.cameras: Input should be a mapping of keys to values (found 3)"),
     ],
 )
-def test_what_is_wrong_is_said_once_without_the_inner_names_of_pydantic(wrong: str, line: str) -> None:
-    (found,) = complaints(wrong)
-    assert found.startswith(line)
+def test_wrong_value_is_reported_once_without_pydantic_type_names(wrong: str, line: str) -> None:
+    (reported,) = error_lines(wrong)
+    assert reported.startswith(line)

@@ -1,4 +1,4 @@
-"""Each knob says what it affects; when it changes, that becomes another one, and nothing else does."""
+"""Each config key is annotated with what it affects: changing the key invalidates this, and nothing else."""
 
 import json
 import shutil
@@ -27,9 +27,11 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.settings import USED_KEYS, load_planning_config
 from vjepa2_ac.runs.folder import check_run_folder, open_run_folder
 
-# What cannot be guessed from a knob's type, or must exist in the data set.
-SECTIONS = {"model.encoder": EncoderConfig(path="encoder.pt")}  # of knobs that are null: those without a default
-OTHERS = {
+# Values that cannot be derived from the type of a key, or must exist in the data set.
+SECTIONS = {
+    "model.encoder": EncoderConfig(path="encoder.pt")
+}  # sections that are null by default and have required keys
+OTHER_VALUES = {
     "planning.limits.workspace": ((0.3, -0.3, 0.1), (0.6, 0.3, 0.5)),
     "data.camera": {"npz": "pixels", "rlds": "wrist_left", "lerobot": "wrist_left", "droid_raw": "right"},
     "data.path": "elsewhere",
@@ -52,28 +54,28 @@ OTHERS = {
     "data.lerobot.select": (6, 5, 4, 3, 2, 1, 0),
     "data.fields.select": (6, 5, 4, 3, 2, 1, 0),
 }  # fmt: skip
-ONLY_REMOTE = {"data.outcome"}  # where reading the episodes costs something
-OF_THE_INDEX = {"camera", "states", "actions", "pose_frame"}
-NOT_OF_THE_INDEX = {"fields.language", "fields.joint_velocity", "fields.control_rate_hz"}
+ONLY_REMOTE = {"data.outcome"}  # keys that are read only if reading the episodes is expensive
+INDEX_KEYS = {"camera", "states", "actions", "pose_frame"}
+NON_INDEX_KEYS = {"fields.language", "fields.joint_velocity", "fields.control_rate_hz"}
 
 
-class Found(Exception):  # noqa: N818 - it carries what was asked for
-    """A key, found where it is about to be used."""
+class LookedUp(Exception):  # noqa: N818 - it carries a value and is not an error
+    """Carries the key with which an index or idle ranges are looked up."""
 
 
-def literals(annotation: Any) -> list[Any]:
+def literal_values(annotation: Any) -> list[Any]:
     if get_origin(annotation) is Literal:
         return list(get_args(annotation))
-    return [one for inner in get_args(annotation) for one in literals(inner)]
+    return [value for inner in get_args(annotation) for value in literal_values(inner)]
 
 
-def another(value: Any, annotation: Any) -> Any:
-    """Return another value of the kind of this one."""
+def other_value(value: Any, annotation: Any) -> Any:
+    """Return another value of the same type."""
     if isinstance(value, bool):
         return not value
     if isinstance(value, int | float):
         return value + 1 if isinstance(value, int) else value / 2 or 0.5
-    options = [one for one in literals(annotation) if one != value]
+    options = [option for option in literal_values(annotation) if option != value]
     if isinstance(value, tuple) and value and isinstance(value[0], float):
         return (value[0] / 2, *value[1:])
     if isinstance(value, tuple):
@@ -85,20 +87,24 @@ def another(value: Any, annotation: Any) -> Any:
     return options[-1] if options else "else"
 
 
-def absent(annotation: Any) -> Any:
-    """Return the section of a knob that is null."""
-    return next(one for one in get_args(annotation) if one)()
+def default_section(annotation: Any) -> Any:
+    """Return a section with default values for a key that is null."""
+    return next(kind for kind in get_args(annotation) if kind)()
 
 
-def with_other(section: BaseModel, key: str, whole: str, source: str) -> BaseModel:
-    """Return a section in which one knob has another value; what does not fit to it stays."""
+def with_other_value(section: BaseModel, key: str, full_key: str, source: str) -> BaseModel:
+    """Return a section in which one key has another value; the result is not validated."""
     name, _, rest = key.partition(".")
     value, field = getattr(section, name), type(section).model_fields[name]
     if rest and not isinstance(value, tuple):
-        inner = value if value is not None else SECTIONS.get(whole.rpartition(".")[0]) or absent(field.annotation)
-        return section.model_copy(update={name: with_other(inner, rest, whole, source)})
-    given = OTHERS.get(whole.removesuffix(f".{rest}"), another(value, field.annotation))
-    return section.model_copy(update={name: given[source] if whole == "data.camera" else given})
+        inner = (
+            value
+            if value is not None
+            else SECTIONS.get(full_key.rpartition(".")[0]) or default_section(field.annotation)
+        )
+        return section.model_copy(update={name: with_other_value(inner, rest, full_key, source)})
+    changed = OTHER_VALUES.get(full_key.removesuffix(f".{rest}"), other_value(value, field.annotation))
+    return section.model_copy(update={name: changed[source] if full_key == "data.camera" else changed})
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +113,8 @@ def sets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: write(root / name, [0, 1]) for name, write in WRITERS.items()}
 
 
-def recorded_by(source: str) -> dict[str, Any]:
-    """Return the knobs of vectors and the commands recorded with them."""
+def vector_options(source: str) -> dict[str, Any]:
+    """Return the options for state vectors and recorded actions."""
     action = {"lerobot": {"action": ["action.joint_velocity"]}} if source == "lerobot" else {}
     return {"states": "vector", "actions": "recorded", "join_actions": "last", **action}
 
@@ -118,8 +124,8 @@ def config_of(source: str, path: str | Path, run_dir: Path, **data: Any) -> Conf
     return parse_config({"run_dir": str(run_dir), "data": data, "model": {"base": "base"}}, where="")
 
 
-def parse_adapter_config(config: Config) -> set[str]:
-    """Return the knobs that a config of its form of data has."""
+def config_keys(config: Config) -> set[str]:
+    """Return the keys of a config with its data format."""
     foreign = set(DataConfig.kinds.values()) - {type(config.data)}
     names = ("replay.", *(f"data.{name}." for kind in foreign for name in kind.format_sections()))  # see test_replay.py
     return {key for key in collect_effects(Config) if not key.startswith(names)}
@@ -132,27 +138,27 @@ def world_model() -> WorldModel:
 
 @pytest.fixture
 def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str | None]]:
-    """Return the keys by which index, idle ranges and latents of a config are looked for; None: the data refuse it."""
+    """Return the lookup keys of index, idle ranges and latents for a config; None if the data set rejects the config."""
 
     def stop(_: Any, keys: Any, *__: Any, **___: Any) -> None:
-        raise Found(keys)
+        raise LookedUp(keys)
 
     for source in WRITERS:
         monkeypatch.setattr(f"vjepa2_ac.data.sources.{source}.get_or_build_index", stop)
     monkeypatch.setattr(idle_ranges, "get_or_build", stop)
 
-    def found(action: Callable[[], Any]) -> Any:
-        with pytest.raises(Found) as caught:
+    def looked_up(action: Callable[[], Any]) -> Any:
+        with pytest.raises(LookedUp) as caught:
             action()
         return caught.value.args[0]
 
     def keys(config: Config) -> dict[str, str | None]:
         try:
-            index: str = found(lambda: open_source(config.data).infos())
+            index: str = looked_up(lambda: open_source(config.data).infos())
         except InputError:
             return dict.fromkeys(("index", "idle", "latents"))
         table = replace(EpisodeTable.from_infos([EpisodeInfo("one", 9, None)]), texts={"index": index})
-        ranges = found(lambda: idle_ranges.find_ranges(open_source(config.data), table, config.data, None))
+        ranges = looked_up(lambda: idle_ranges.find_ranges(open_source(config.data), table, config.data, None))
         latents = build_cache_key(config.data, index, get_encoding(world_model(), config))
         return {"index": index, "idle": ranges, "latents": latents.digest}
 
@@ -168,7 +174,7 @@ def test_config_key_without_affects_annotation_raises() -> None:
         values_that_affect(Affects.RUN, Forgotten())
 
 
-def test_the_options_of_a_plug_in_are_a_part_of_the_key_of_a_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_of_a_plugin_data_format_change_the_cache_key(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(DataConfig, "kinds", dict(DataConfig.kinds))
 
     class WallOptions(Section):
@@ -192,63 +198,63 @@ def test_changed_key_invalidates_exactly_what_it_affects(
 ) -> None:
     if (source, states) == ("droid_raw", "vector"):
         pytest.skip("raw DROID has poses")
-    config = config_of(source, sets[source], tmp_path, **(recorded_by(source) if states == "vector" else {}))
-    usual, own = keys_of(config), tuple(f"data.{name}." for name in config.data.format_sections())
-    assert None not in usual.values()
+    config = config_of(source, sets[source], tmp_path, **(vector_options(source) if states == "vector" else {}))
+    old, format_keys = keys_of(config), tuple(f"data.{name}." for name in config.data.format_sections())
+    assert None not in old.values()
     changed: dict[str, set[str]] = {}
-    for key in parse_adapter_config(config) - {"data.source", "data.path"} - ONLY_REMOTE:
-        found = keys_of(with_other(config, key, key, source))
-        if None not in found.values():  # else refused, not mistaken
-            changed[key] = {name for name in usual if found[name] != usual[name]}
+    for key in config_keys(config) - {"data.source", "data.path"} - ONLY_REMOTE:
+        new = keys_of(with_other_value(config, key, key, source))
+        if None not in new.values():  # the data set did not reject the value
+            changed[key] = {name for name in old if new[name] != old[name]}
     for key, names in changed.items():
         name, is_latents = key.removeprefix("data."), Affects.LATENTS in collect_effects(Config)[key]
-        is_index = name in OF_THE_INDEX or (key.startswith(own) and name not in NOT_OF_THE_INDEX)
+        is_index = name in INDEX_KEYS or (key.startswith(format_keys) and name not in NON_INDEX_KEYS)
         assert names <= {"latents"} or is_latents, key
         assert "latents" in names or not is_latents, key
         assert "index" not in names or is_index, key
-        assert ("idle" in names) == ("index" in names or key.startswith((*own, "data.idle."))), key
+        assert ("idle" in names) == ("index" in names or key.startswith((*format_keys, "data.idle."))), key
     assert {key for key, names in changed.items() if "index" in names}
     assert len(changed) > 50
 
 
 @pytest.mark.parametrize("source", WRITERS)
-def test_a_data_set_that_was_moved_is_the_same_and_one_that_changed_is_another(
+def test_moved_data_set_keeps_its_keys_and_a_changed_one_does_not(
     source: str, sets: dict[str, Path], keys_of: Callable[[Config], dict[str, str | None]], tmp_path: Path
 ) -> None:
     shutil.copytree(sets[source], tmp_path / "moved", copy_function=shutil.copy2)
-    here, there = (config_of(source, path, tmp_path) for path in (sets[source], tmp_path / "moved"))
-    assert keys_of(there) == keys_of(here)
+    original, moved = (config_of(source, path, tmp_path) for path in (sets[source], tmp_path / "moved"))
+    assert keys_of(moved) == keys_of(original)
     largest = max((tmp_path / "moved").rglob("*.*"), key=lambda path: path.stat().st_size)
     largest.touch()
-    assert keys_of(there)["index"] != keys_of(here)["index"]
+    assert keys_of(moved)["index"] != keys_of(original)["index"]
 
 
 def with_encoder(config: Config) -> Config:
-    """Return a config whose base comes without an encoder: both of its paths may be moved."""
+    """Return a config whose base model has no encoder, so that two paths can be changed."""
     model = config.model.model_copy(update={"encoder": SECTIONS["model.encoder"]})
     return config.model_copy(update={"model": model})
 
 
-def test_settings_of_a_later_start_are_kept_in_the_run_unless_they_decide_it(tmp_path: Path) -> None:
+def test_changed_keys_without_effect_on_the_run_are_saved_and_recorded_at_resume(tmp_path: Path) -> None:
     config = with_encoder(config_of("rlds", tmp_path, tmp_path / "run"))
     open_run_folder(config, "name")
-    file, written, kept = tmp_path / "run/config.yaml", config_as_yaml(config), 0
+    file, saved, num_changes = tmp_path / "run/config.yaml", config_as_yaml(config), 0
     keys = [
         key
-        for key in parse_adapter_config(config) - {"run_dir", "data.source"}
+        for key in config_keys(config) - {"run_dir", "data.source"}
         if Affects.RUN not in collect_effects(Config)[key]
     ]
     for section in {key.partition(".")[0] for key in keys}:
         start = config
         for key in keys:
-            start = with_other(start, key, key, "rlds") if key.startswith(section) else start
-        file.write_text(written)
+            start = with_other_value(start, key, key, "rlds") if key.startswith(section) else start
+        file.write_text(saved)
         open_run_folder(start, "name")
         assert yaml.safe_load(file.read_text()) == config_as_dict(start)
         changes = json.loads((tmp_path / "run/environment.json").read_text())[-1]["config_changes"]
-        assert len(changes) == len(changed_keys(config, start)), "what held before is recorded"
-        kept += len(changes)
-    assert kept > 50
+        assert len(changes) == len(changed_keys(config, start)), "every changed key must be recorded"
+        num_changes += len(changes)
+    assert num_changes > 50
 
 
 def test_run_resumes_only_if_no_key_that_affects_it_has_changed(tmp_path: Path) -> None:
@@ -256,8 +262,8 @@ def test_run_resumes_only_if_no_key_that_affects_it_has_changed(tmp_path: Path) 
     (tmp_path / "run").mkdir()
     (tmp_path / "run/config.yaml").write_text(config_as_yaml(config))
     check_run_folder(config)
-    for key in parse_adapter_config(config):
-        other = with_other(config, key, key, "rlds")
+    for key in config_keys(config):
+        other = with_other_value(config, key, key, "rlds")
         if key in {"run_dir", "data.source"} or not changed_keys(config, other):
             continue
         if Affects.RUN in collect_effects(Config)[key]:
@@ -267,13 +273,12 @@ def test_run_resumes_only_if_no_key_that_affects_it_has_changed(tmp_path: Path) 
             check_run_folder(other)
 
 
-def test_planning_takes_the_values_that_affect_a_decision_and_names_them() -> None:
-    for key, mark in collect_effects(Config).items():
-        named = key in USED_KEYS or key.startswith(
-            tuple(one.removesuffix("…") for one in USED_KEYS if one.endswith("…"))
-        )
-        assert (Affects.PLAN in mark) == named, key
-        if Affects.PLAN not in mark:
+def test_planning_accepts_only_keys_that_affect_a_decision_and_lists_them() -> None:
+    for key, effect in collect_effects(Config).items():
+        prefixes = tuple(used.removesuffix("…") for used in USED_KEYS if used.endswith("…"))
+        is_listed = key in USED_KEYS or key.startswith(prefixes)
+        assert (Affects.PLAN in effect) == is_listed, key
+        if Affects.PLAN not in effect:
             with pytest.raises(InputError, match=r"planning does not use.*model\.sizes\.…, model\.dtype"):
                 load_planning_config("model.pt", overrides=[f"{key}=1"])
 
@@ -288,9 +293,9 @@ def test_annotation_of_a_section_applies_to_its_keys_and_their_values() -> None:
         get_effect("nothing.of.the.kind", Config)
 
 
-def test_the_values_that_affect_something_are_given_with_their_values(tmp_path: Path) -> None:
+def test_values_that_affect_planning_are_returned_by_section(tmp_path: Path) -> None:
     config = config_of("rlds", tmp_path, tmp_path)
-    found = values_that_affect(Affects.PLAN, config)
-    assert sorted(found) == ["data", "model", "planning", "seed", "training"]
-    assert found["training"] == {"device": "auto"}
-    assert found["data"] == {"stride": 4, "crop": "released"}
+    values = values_that_affect(Affects.PLAN, config)
+    assert sorted(values) == ["data", "model", "planning", "seed", "training"]
+    assert values["training"] == {"device": "auto"}
+    assert values["data"] == {"stride": 4, "crop": "released"}

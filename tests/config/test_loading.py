@@ -1,4 +1,4 @@
-"""Config loading: every knob once, all errors at once."""
+"""Config loading: files, overrides, packaged configs and options of components."""
 
 import re
 from operator import attrgetter
@@ -33,25 +33,25 @@ def write(folder: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.name)
-def test_every_config_of_the_project_loads_and_is_in_line(path: Path) -> None:
+def test_every_packaged_config_loads_without_an_alpha_warning(path: Path) -> None:
     assert load_config(path).adapter.alpha_warning is None
 
 
 def test_large_alpha_with_rslora_gives_a_warning() -> None:
-    found = AdapterConfig(rank=64, alpha=128).alpha_warning
-    assert "a scale of 16; alpha 32 gives 4" in found
-    assert "Set adapter.alpha=32" in found
-    for usual in (
+    warning = AdapterConfig(rank=64, alpha=128).alpha_warning
+    assert "a scale of 16; alpha 32 gives 4" in warning
+    assert "Set adapter.alpha=32" in warning
+    for values in (
         {"rank": 64},
         {"rank": 4, "alpha": 8},
         {"alpha": 128, "rslora": False},
         {"kind": "none", "alpha": 128},
     ):
-        assert AdapterConfig.model_validate(usual).alpha_warning is None
+        assert AdapterConfig.model_validate(values).alpha_warning is None
 
 
 @pytest.mark.parametrize("adapter", [{"modules_to_save": ["state_encoder"]}, {"targets": ["q", "state_encoder"]}])
-def test_an_adapter_on_the_states_of_a_model_without_states_is_refused(adapter: dict[str, object]) -> None:
+def test_adapter_on_the_state_encoder_of_a_model_without_states_raises(adapter: dict[str, object]) -> None:
     model = {"base": "b.pt", "sizes": {"predictor": {"use_states": False}}}
     with pytest.raises(
         InputError, match=rf"adapter\.{next(iter(adapter))}: with predictor.use_states: false there is no state_encoder"
@@ -61,12 +61,12 @@ def test_an_adapter_on_the_states_of_a_model_without_states_is_refused(adapter: 
     parse_config({**MINIMAL, "adapter": adapter}, where="here")
 
 
-def test_a_resolved_config_reads_back_equal(tmp_path: Path) -> None:
+def test_resolved_config_loads_as_an_equal_config(tmp_path: Path) -> None:
     config = parse_config(MINIMAL, where="here")
     assert load_config(write(tmp_path, config_as_yaml(config))) == config
 
 
-def test_overrides_reach_nested_keys_and_read_numbers_as_people_write_them(tmp_path: Path) -> None:
+def test_overrides_set_nested_keys_and_accept_scientific_notation(tmp_path: Path) -> None:
     path = write(tmp_path, yaml.safe_dump(MINIMAL))
     config = load_config(
         path, ["training.learning_rate=3e-4", "adapter.targets=[q, v]", "data.fields.gripper_open=0.5"]
@@ -77,28 +77,29 @@ def test_overrides_reach_nested_keys_and_read_numbers_as_people_write_them(tmp_p
 
 
 @pytest.mark.parametrize("written", ["22008760", '"22008760"'])
-def test_the_serial_number_of_a_camera_needs_no_quotes(tmp_path: Path, written: str) -> None:
+def test_camera_serial_number_is_read_as_text_with_and_without_quotes(tmp_path: Path, written: str) -> None:
     path = write(tmp_path, yaml.safe_dump(MINIMAL))
     for camera in (f"data.camera={written}", f"data.camera=[{written}]"):
         assert load_config(path, ["data.source=droid_raw", camera]).data.cameras == ("22008760",)
 
 
-def test_words_that_yaml_takes_for_truth_values_are_words(tmp_path: Path) -> None:
+def test_option_names_that_yaml_reads_as_booleans_stay_text(tmp_path: Path) -> None:
     path, sections = write(tmp_path, yaml.safe_dump(MINIMAL)), config_schema()["$defs"]
-    found = []
+    checked = []
     for key in all_keys():
-        section, _, name = key.rpartition(".")
-        knob = next((one["properties"][name] for one in sections.values() if name in one.get("properties", {})), {})
-        for word in knob.get("enum", ()):
-            if section and yaml.safe_load(str(word)) != word:
-                needed = ["replay.data.path=d"] * key.startswith("replay.")
-                assert attrgetter(key)(load_config(path, [f"{key}={word}", *needed])) == word
-                found.append(key)
-    assert {"data.cache", "training.compile", "planning.compile"} <= set(found)
+        outer, _, name = key.rpartition(".")
+        properties = (section.get("properties", {}) for section in sections.values())
+        schema = next((known[name] for known in properties if name in known), {})
+        for word in schema.get("enum", ()):
+            if outer and yaml.safe_load(str(word)) != word:
+                required = ["replay.data.path=d"] * key.startswith("replay.")
+                assert attrgetter(key)(load_config(path, [f"{key}={word}", *required])) == word
+                checked.append(key)
+    assert {"data.cache", "training.compile", "planning.compile"} <= set(checked)
 
 
 @pytest.mark.parametrize("text", ["", "- a list", "{unclosed", "run_dir: a\nrun_dir: b"])
-def test_what_is_not_a_config_is_refused(tmp_path: Path, text: str) -> None:
+def test_invalid_or_missing_config_file_raises_with_its_path(tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError, match=r"config\.yaml"):
         load_config(write(tmp_path, text))
     with pytest.raises(InputError, match=r"nowhere\.yaml"):
@@ -119,16 +120,16 @@ def test_override_of_data_source_removes_options_of_the_former_format(tmp_path: 
 def test_every_config_key_is_read() -> None:
     source = "\n".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
     read = {(owner.removeprefix("_"), name) for owner, name in re.findall(r"(\w+)(?=\.(\w+))", source)}
-    for key in set(all_keys()) - {"plugins"}:  # these are read before the config is checked
+    for key in set(all_keys()) - {"plugins"}:  # plug-ins are read before the config is validated
         *sections, name = key.split(".")
-        owners = ["config", "sizes", "knobs", "self", "fields", *sections[-1:]]
-        assert any((owner, name) in read for owner in owners), f"nobody reads {key}"
+        owners = ["config", "sizes", "self", "fields", *sections[-1:]]
+        assert any((owner, name) in read for owner in owners), f"{key} is not read by any module"
 
 
 @pytest.mark.parametrize(
     "name", ["1e-4", "010", "1:30", "2024-01-01", "089", "on", "null", "0x1F", "1_0", "=", "é #: ü"]
 )
-def test_text_that_looks_like_a_number_stays_text_when_written_and_read(tmp_path: Path, name: str) -> None:
+def test_text_that_looks_like_a_number_stays_text_in_yaml(tmp_path: Path, name: str) -> None:
     config = parse_config(MINIMAL | {"run_dir": name, "data": {"path": "d", "exclude": [name]}}, where="")
     assert load_config(write(tmp_path, config_as_yaml(config))) == config
 
@@ -136,14 +137,14 @@ def test_text_that_looks_like_a_number_stays_text_when_written_and_read(tmp_path
 # ---- configs of the package ----
 
 
-def test_the_folder_of_a_checkout_is_that_of_the_package() -> None:
+def test_packaged_configs_equal_the_configs_folder() -> None:
     assert list(packaged_configs()) == sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
     assert load_config("builtin:demo") == load_config(ROOT / "configs/demo.yaml")
     assert all(packaged_configs().values())
 
 
 @pytest.mark.parametrize("name", ["nothing", "", "../sim-tiny/config", "demo.yaml", "/etc/passwd"])
-def test_a_name_that_is_none_lists_those_that_are(name: str) -> None:
+def test_unknown_packaged_config_raises_with_the_available_names(name: str) -> None:
     with pytest.raises(
         InputError, match=r"the package has no config of this name.*builtin:demo, .*builtin:scratch_vitl"
     ):
@@ -166,17 +167,17 @@ class WithAlpha:
     Config = AlphaOptions
 
 
-MINE = {"name": "mine", "options": {"alphaa": 1}}
+WRONG_OPTION = {"name": "mine", "options": {"alphaa": 1}}
 
 
 @pytest.mark.parametrize(
     ("registry", "section", "values"),
     [
-        (LOSSES, "training.loss.options", {"loss": MINE}),
-        (PLANNERS, "planning.planner.options", {"planner": MINE}),
-        (ENERGIES, "planning.energy.distance.options", {"energy": {"distance": MINE}}),
+        (LOSSES, "training.loss.options", {"loss": WRONG_OPTION}),
+        (PLANNERS, "planning.planner.options", {"planner": WRONG_OPTION}),
+        (ENERGIES, "planning.energy.distance.options", {"energy": {"distance": WRONG_OPTION}}),
         (TRACKERS, "tracking.others.mine", {"others": {"mine": {"alphaa": 1}}}),
-        (TRANSFORMS, "data.transforms.0.options", {"transforms": [MINE]}),
+        (TRANSFORMS, "data.transforms.0.options", {"transforms": [WRONG_OPTION]}),
     ],
 )
 def test_wrong_option_error_has_the_dotted_key(
@@ -199,9 +200,7 @@ def test_missing_required_options_raise_without_any_options(monkeypatch: pytest.
         parse_config(MINIMAL | {"training": {"loss": {"options": {"a": 1}}}}, where="x.yaml")
 
 
-def test_a_config_larger_than_a_megabyte_is_refused_before_it_is_parsed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_config_larger_than_a_megabyte_raises_before_parsing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vjepa2_ac.config.loading.parse_yaml", lambda *_, **__: pytest.fail("parsed"))
     path = tmp_path / "config.yaml"
     path.write_text("#" * 1_000_001)

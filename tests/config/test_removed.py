@@ -1,4 +1,4 @@
-"""Configs with keys of version 0.1: those of runs load, and a config of a user gets one plain error."""
+"""Configs with keys of version 0.1: the config of an older run loads; in any other config such a key is an error."""
 
 import logging
 
@@ -17,13 +17,13 @@ def removed_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(REMOVED, "data.blur", RemovedKey("off", ({"radius": 0},)))
 
 
-def test_removed_key_in_a_config_of_a_user_is_one_error_that_names_the_value_of_today() -> None:
+def test_removed_key_in_a_user_config_raises_with_the_current_value() -> None:
     with pytest.raises(InputError, match=r"training.momentum: removed in 0.2; it is always 0.9 now. Delete the key"):
         parse_config({**VALUES, "training": {"momentum": 0.9}}, where="mine.yaml")
 
 
 @pytest.mark.parametrize("value", [0.9, 0.5])
-def test_config_of_an_older_run_loads_and_a_value_that_changed_is_a_warning(
+def test_config_of_an_older_run_loads_with_a_warning_for_a_changed_value(
     value: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     older = {**VALUES, "training": {"momentum": value}}
@@ -35,7 +35,7 @@ def test_config_of_an_older_run_loads_and_a_value_that_changed_is_a_warning(
     ] * (value != 0.9)
 
 
-def test_removed_section_of_data_is_dropped_from_replay_too() -> None:
+def test_removed_section_of_data_is_dropped_from_replay() -> None:
     replay = {"data": {"source": "npz", "path": "other", "blur": {"radius": 0}}}
     older = {**VALUES, "data": {"source": "npz", "path": "data", "blur": {"radius": 0}}, "replay": replay}
     values = config_as_dict(parse_config(older, where="run/config.yaml", local_plugins=False))
@@ -43,14 +43,14 @@ def test_removed_section_of_data_is_dropped_from_replay_too() -> None:
     assert "blur" not in values["replay"]["data"]
 
 
-def test_model_section_of_version_0_1_has_the_meaning_of_today() -> None:
+def test_model_section_of_version_0_1_loads_as_the_current_section() -> None:
     scratch, sizes = {**VALUES, "adapter": {"kind": "none"}}, {"predictor": {"width": 64, "depth": 2, "heads": 4}}
     older = {"base": None, "random": sizes, "encoder_weights": "target_encoder", "random_start": "persistence"}
-    found = parse_config({**scratch, "model": older}, where="run/config.yaml", local_plugins=False)
-    assert found == parse_config({**scratch, "model": {"base": "random", "sizes": sizes}}, where="today")
+    config = parse_config({**scratch, "model": older}, where="run/config.yaml", local_plugins=False)
+    assert config == parse_config({**scratch, "model": {"base": "random", "sizes": sizes}}, where="today")
 
 
-def test_no_removed_key_is_a_key_of_today() -> None:
+def test_removed_keys_do_not_exist_in_the_current_config() -> None:
     assert not set(REMOVED) & set(all_keys())
 
 
@@ -73,10 +73,10 @@ def test_options_of_an_older_run_move_to_their_components() -> None:
         "training": {"loss": {"name": "smooth_l1", "options": {"beta": 0.5}}},
         "planning": {"planner": {"name": "icem", "options": {"elites": 20}}, "energy": {"distance": "l2"}},
     }
-    read = [
+    configs = [
         parse_config(values, where="run/config.yaml", local_plugins=False) for values in (older, {**VALUES, **today})
     ]
-    assert read[0] == read[1]
+    assert configs[0] == configs[1]
     changed = parse_config(older, ["planning.planner.options.elites=30"], where="run/config.yaml", local_plugins=False)
     assert changed.planning.planner.options == {"elites": 30}
     with pytest.raises(InputError, match=r"planning.icem: moved in 0.2, to planning.planner: {name: icem, options"):
@@ -129,7 +129,7 @@ def test_start_std_of_an_older_run_moves_to_the_planner_or_is_a_warning(caplog: 
         {"data": {**VALUES["data"], "fields": {"gripper": ["closedness"]}}},
     ],
 )
-def test_values_of_another_type_in_the_config_of_an_older_run_are_an_error(values: dict[str, object]) -> None:
+def test_values_of_wrong_type_in_the_config_of_an_older_run_raise(values: dict[str, object]) -> None:
     with pytest.raises(InputError, match=r"run/config\.yaml"):
         parse_config({**VALUES, **values}, where="run/config.yaml", local_plugins=False)
 
@@ -145,18 +145,18 @@ def test_linear_schedule_without_steps_decays_from_the_warm_up_to_the_last_step(
     assert (config.training.schedule, config.training.decay_steps) == ("warmup_stable_decay", decay_steps)
 
 
-def test_options_of_a_component_are_given_by_its_name_or_by_overrides() -> None:
+def test_component_options_are_set_with_overrides() -> None:
     config = parse_config(VALUES, ["planning.planner=icem", "planning.planner.options.elites=20"], where="mine.yaml")
     assert config_as_dict(config)["planning"]["planner"] == {"name": "icem", "options": {"elites": 20}}
-    usual = parse_config(VALUES, ["planning.planner.options.elites=10"], where="mine.yaml")
-    assert config_as_dict(usual)["planning"]["planner"] == "cem", "an option with the default's value is left out"
+    default = parse_config(VALUES, ["planning.planner.options.elites=10"], where="mine.yaml")
+    assert config_as_dict(default)["planning"]["planner"] == "cem", "an option with its default value must not be saved"
     with pytest.raises(InputError, match=r"planning.planner.options.elite: unknown key; did you mean elites"):
         parse_config(VALUES, ["planning.planner.options.elite=20"], where="mine.yaml")
     with pytest.raises(InputError, match=r"planning.planner: a name, or {name: NAME, options"):
         parse_config(VALUES, ["planning.planner={elites: 20}"], where="mine.yaml")
 
 
-def test_removed_key_on_the_command_line_of_a_run_is_an_error() -> None:
+def test_removed_key_in_an_override_of_a_run_raises() -> None:
     for override, words in {
         "training.momentum=0.9": "removed in 0.2; it is always 0.9 now",
         "planning.cem.elites=5": "moved in 0.2, to planning.planner",

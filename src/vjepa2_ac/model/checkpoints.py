@@ -166,10 +166,10 @@ def to_official(model: WorldModel) -> dict[str, Any]:
     if model.predictor is not model.base_predictor:
         raise ValueError("the model has an adapter: call merge_adapter first")
     if not model.sizes.predictor.use_states or get_model_widths(model.sizes) != POSE_WIDTHS:
-        found = f"a model with {describe_model_widths(model.sizes)}"
+        problem = f"a model with {describe_model_widths(model.sizes)}"
         needed = f"states and actions of {POSE_WIDTHS.state} numbers: Meta's code has no other predictor"
         fix = "Export it with --to merged (WorldModel.save_pretrained), which `model.base` takes"
-        raise InputError(where="the official format", found=found, needed=needed, fix=fix)
+        raise InputError(where="the official format", found=problem, needed=needed, fix=fix)
     encoder = to_official_names(model.loaded_encoder.state_dict(), model.sizes.encoder.family)
     return {
         "encoder": encoder,

@@ -1,4 +1,4 @@
-"""Adapter files of unknown origin: converted to our knobs, or refused by name; PEFT does not see them."""
+"""Adapter files of unknown origin: converted to our config, or rejected with the name of the option; never read by PEFT."""
 
 import json
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from vjepa2_ac.model.world_model import WorldModel
 
 Fresh = Callable[..., WorldModel]
 
-KNOBS = AdapterConfig(
+CONFIG = AdapterConfig(
     rank=4,
     alpha=8.0,
     dropout=0.25,
@@ -31,7 +31,7 @@ KNOBS = AdapterConfig(
 @pytest.fixture
 def folder(fresh: Fresh, tmp_path: Path) -> Path:
     model = fresh()
-    add_adapter(model, KNOBS, seed=0)
+    add_adapter(model, CONFIG, seed=0)
     save_trained(model, tmp_path)
     return tmp_path
 
@@ -41,15 +41,15 @@ def rewrite(folder: Path, changes: dict[str, Any], file: str = ADAPTER_FILE) -> 
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
-def test_what_this_program_writes_names_its_layers_and_holds_no_pattern_of_the_users(folder: Path) -> None:
-    read = parse_adapter_config(json.loads((folder / ADAPTER_FILE).read_text()), where="it")
+def test_saved_adapter_config_has_layer_names_instead_of_user_patterns(folder: Path) -> None:
+    read = parse_adapter_config(json.loads((folder / ADAPTER_FILE).read_text()), where="here")
     ranks = {f"blocks.{index}.mlp.fc1": 6 for index in range(2)}
     resolved = {"rank_pattern": ranks, "alpha_pattern": {"blocks.0.mlp.fc1": 3.5}}
-    assert read == KNOBS.model_copy(update={"targets": ("fc1", "q"), "peft": resolved})
+    assert read == CONFIG.model_copy(update={"targets": ("fc1", "q"), "peft": resolved})
 
 
 @pytest.mark.parametrize(
-    ("changes", "complaint"),
+    ("changes", "message"),
     [
         ({"target_modules": "(.*)*(a+)+$"}, "targets: Input should be a list"),
         ({"target_modules": ["(a+)+$"]}, "matches no layer of the predictor"),
@@ -65,29 +65,29 @@ def test_what_this_program_writes_names_its_layers_and_holds_no_pattern_of_the_u
         ({"use_of_the_future": 1}, "'use_of_the_future'"),
     ],
 )
-def test_what_no_adapter_of_ours_can_be_is_refused_by_name(
-    fresh: Fresh, folder: Path, changes: dict[str, Any], complaint: str
+def test_unsupported_adapter_option_raises_with_its_name(
+    fresh: Fresh, folder: Path, changes: dict[str, Any], message: str
 ) -> None:
-    on = fresh()
-    add_adapter(on, KNOBS, seed=1)
-    load_trained(on, folder)
+    adapted = fresh()
+    add_adapter(adapted, CONFIG, seed=1)
+    load_trained(adapted, folder)
     rewrite(folder, changes)
-    for model in (fresh(), on):
-        if model is on and complaint == "matches no layer of the predictor":
-            complaint = "Expected ('fc1', 'q'), as in the model"
+    for model in (fresh(), adapted):
+        if model is adapted and message == "matches no layer of the predictor":
+            message = "Expected ('fc1', 'q'), as in the model"
         with pytest.raises(InputError) as caught:
             load_trained(model, folder)
-        assert complaint in str(caught.value)
+        assert message in str(caught.value)
 
 
-def test_what_another_version_of_peft_writes_of_what_is_off_is_no_obstacle(fresh: Fresh, folder: Path) -> None:
+def test_disabled_options_of_another_peft_version_are_ignored(fresh: Fresh, folder: Path) -> None:
     later = {"peft_version": "9.9", "some_config": None, "use_it": False, "its_pattern": {}, "qalora_group_size": 16}
     rewrite(folder, later)
     load_trained(fresh(), folder)
 
 
 @pytest.mark.parametrize("start", ["pissa", "loftq"])
-def test_a_start_that_changes_the_base_is_refused(start: str) -> None:
+def test_initialisation_that_changes_the_base_weights_raises(start: str) -> None:
     with pytest.raises(ValidationError, match="changes the base weights"):
         AdapterConfig(peft={"init_lora_weights": start})
 
@@ -98,7 +98,7 @@ def test_peft_option_with_its_own_config_key_raises() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "complaint"),
+    ("changes", "message"),
     [
         ({"kind": ["lora"]}, "kind: Input should be 'lora' or 'none'"),
         ({"encoder": None}, "encoder: Input should be a valid string"),
@@ -107,10 +107,10 @@ def test_peft_option_with_its_own_config_key_raises() -> None:
         ({"more": 1}, "more: unknown"),
     ],
 )
-def test_a_card_of_other_types_is_refused_by_name(
-    fresh: Fresh, folder: Path, changes: dict[str, Any], complaint: str
+def test_card_with_wrong_types_raises_with_the_key(
+    fresh: Fresh, folder: Path, changes: dict[str, Any], message: str
 ) -> None:
     rewrite(folder, changes, CARD)
     with pytest.raises(InputError) as caught:
         load_trained(fresh(), folder)
-    assert complaint in str(caught.value)
+    assert message in str(caught.value)

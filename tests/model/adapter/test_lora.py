@@ -1,4 +1,4 @@
-"""Properties of an adapter."""
+"""Properties of adapters: fresh, trained, disabled, saved, loaded and merged."""
 
 import copy
 import json
@@ -26,7 +26,7 @@ from vjepa2_ac.model.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.world_model import WorldModel
 
 LORA = AdapterConfig(rank=4, alpha=8.0, dropout=0.0)
-EVERYTHING = AdapterConfig(kind="none")
+FULL = AdapterConfig(kind="none")
 Fresh = Callable[..., WorldModel]
 METHODS = {
     "lora": LORA,
@@ -42,7 +42,7 @@ METHODS = {
         rank=4, alpha=8.0, targets=("blocks.1.attn.q", "fc1"), peft={"init_lora_weights": "gaussian"}
     ),
 }
-both_kinds = pytest.mark.parametrize("config", [*METHODS.values(), EVERYTHING], ids=[*METHODS, "none"])
+both_kinds = pytest.mark.parametrize("config", [*METHODS.values(), FULL], ids=[*METHODS, "none"])
 every_method = pytest.mark.parametrize("config", METHODS.values(), ids=METHODS)
 both_types = pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 
@@ -53,7 +53,7 @@ def predict(model: WorldModel, inputs) -> Tensor:
 
 
 def train(model: WorldModel, inputs, steps: int = 3) -> None:
-    """Take a few large steps, so that what is trained differs visibly."""
+    """Take a few large steps, so that the trained weights differ clearly."""
     model.train()
     trained = [value for value in model.parameters() if value.requires_grad]
     optimizer = torch.optim.SGD(trained, lr=1.0)
@@ -67,16 +67,16 @@ def train(model: WorldModel, inputs, steps: int = 3) -> None:
 
 @pytest.fixture(scope="module")
 def trained() -> Callable[..., WorldModel]:
-    """Return a model of one's own that was adapted and trained: a copy of what is trained once for each kind."""
-    made: dict[tuple[str, torch.dtype], WorldModel] = {}
+    """Return a copy of a model with trained weights; each kind is trained only once."""
+    models: dict[tuple[str, torch.dtype], WorldModel] = {}
 
     def make(config: AdapterConfig, dtype: torch.dtype = torch.float32) -> WorldModel:
         kind = config.model_dump_json(), dtype
-        if kind not in made:
-            made[kind] = tiny_model(dtype=dtype)
-            add_adapter(made[kind], config, seed=0)
-            train(made[kind], tiny_inputs())
-        return copy.deepcopy(made[kind])
+        if kind not in models:
+            models[kind] = tiny_model(dtype=dtype)
+            add_adapter(models[kind], config, seed=0)
+            train(models[kind], tiny_inputs())
+        return copy.deepcopy(models[kind])
 
     return make
 
@@ -87,7 +87,7 @@ def copies(model: WorldModel) -> dict[str, Tensor]:
 
 @both_types
 @every_method
-def test_a_fresh_adapter_leaves_predictions_unchanged(
+def test_fresh_adapter_leaves_predictions_unchanged(
     fresh: Fresh, inputs, config: AdapterConfig, dtype: torch.dtype
 ) -> None:
     model = fresh(dtype=dtype)
@@ -102,7 +102,9 @@ def test_a_fresh_adapter_leaves_predictions_unchanged(
 
 @both_types
 @every_method
-def test_only_the_adapter_moves_and_all_of_it(fresh: Fresh, inputs, config: AdapterConfig, dtype: torch.dtype) -> None:
+def test_training_changes_exactly_the_adapter_weights(
+    fresh: Fresh, inputs, config: AdapterConfig, dtype: torch.dtype
+) -> None:
     model = fresh(dtype=dtype)
     add_adapter(model, config, seed=0)
     before = copies(model)
@@ -114,8 +116,8 @@ def test_only_the_adapter_moves_and_all_of_it(fresh: Fresh, inputs, config: Adap
         assert torch.equal(value, before[name]) != is_adapter, name
 
 
-def test_everything_but_the_unused_camera_moves_when_all_is_trained(model: WorldModel, inputs) -> None:
-    add_adapter(model, EVERYTHING, seed=0)
+def test_full_fine_tuning_changes_all_predictor_weights_except_unused_extrinsics(model: WorldModel, inputs) -> None:
+    add_adapter(model, FULL, seed=0)
     before = copies(model)
     train(model, inputs)
     for name, value in model.named_parameters():
@@ -124,8 +126,8 @@ def test_everything_but_the_unused_camera_moves_when_all_is_trained(model: World
 
 
 def adapted_layers(model: WorldModel) -> set[str]:
-    found = [name for name, _ in model.base_predictor.named_modules() if name.endswith(".lora_A")]
-    return {name.removesuffix(".lora_A") for name in found}
+    names = [name for name, _ in model.base_predictor.named_modules() if name.endswith(".lora_A")]
+    return {name.removesuffix(".lora_A") for name in names}
 
 
 @pytest.mark.parametrize(
@@ -136,14 +138,14 @@ def adapted_layers(model: WorldModel) -> set[str]:
         (("all",), {"attn.q", "attn.k", "attn.v", "attn.o", "mlp.fc1", "mlp.fc2"}),
     ],
 )
-def test_a_set_of_targets_stands_for_its_layers(model: WorldModel, targets: tuple[str, ...], names: set[str]) -> None:
+def test_target_set_adapts_its_layers(model: WorldModel, targets: tuple[str, ...], names: set[str]) -> None:
     add_adapter(model, LORA.model_copy(update={"targets": targets}), seed=0)
     heads = {"predictor_embed", "predictor_proj", "action_encoder", "state_encoder"} if targets == ("all",) else set()
     assert adapted_layers(model) == {f"blocks.{index}.{name}" for index in range(2) for name in names} | heads
 
 
 @pytest.mark.parametrize(
-    ("knobs", "message"),
+    ("values", "message"),
     [
         ({"peft": {"rank_pattern": {"fc3": 2}}}, r"adapter\.peft: .*rank_pattern keys did not match .*'fc3'"),
         ({"peft": {"rank_pattern": {"(": 2}}}, r"adapter\.peft: missing \)"),
@@ -154,24 +156,24 @@ def test_a_set_of_targets_stands_for_its_layers(model: WorldModel, targets: tupl
     ],
 )
 def test_adapter_key_that_does_not_fit_the_predictor_raises(
-    model: WorldModel, knobs: dict[str, object], message: str
+    model: WorldModel, values: dict[str, object], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        add_adapter(model, LORA.model_copy(update=knobs), seed=0)
+        add_adapter(model, LORA.model_copy(update=values), seed=0)
 
 
 @both_types
 @both_kinds
-def test_switched_off_it_is_the_base_and_switched_on_what_it_was(
+def test_disabled_adapter_predicts_as_base_and_enabled_as_before(
     fresh: Fresh, trained: Fresh, inputs, config: AdapterConfig, dtype: torch.dtype
 ) -> None:
     model = trained(config, dtype)
     base = predict(fresh(dtype=torch.float32 if config.kind == "none" else dtype), inputs)
     before, adapted, count = copies(model), predict(model, inputs), trainable_report(model).trained
     with use_base_weights(model):
-        switched_off = predict(model, inputs)
+        disabled = predict(model, inputs)
     rounding = 0.05 if (config.kind, dtype) == ("none", torch.bfloat16) else 0  # float32 arithmetic on rounded weights
-    torch.testing.assert_close(switched_off, base, rtol=0, atol=rounding)
+    torch.testing.assert_close(disabled, base, rtol=0, atol=rounding)
     assert not torch.allclose(adapted, base, atol=0.05)
     assert torch.equal(predict(model, inputs), adapted)
     assert all(torch.equal(value, before[name]) for name, value in model.named_parameters())
@@ -180,7 +182,7 @@ def test_switched_off_it_is_the_base_and_switched_on_what_it_was(
 
 @both_types
 @both_kinds
-def test_saved_and_loaded_it_is_the_same(
+def test_saved_weights_give_equal_predictions_after_loading(
     fresh: Fresh, trained: Fresh, inputs, tmp_path: Path, config: AdapterConfig, dtype: torch.dtype
 ) -> None:
     model, other = trained(config, dtype), fresh(dtype=dtype)
@@ -191,7 +193,7 @@ def test_saved_and_loaded_it_is_the_same(
 
 
 @both_kinds
-def test_loaded_into_the_adapter_that_is_on_it_is_not_wrapped_twice(
+def test_loading_into_an_adapted_model_does_not_add_a_second_adapter(
     fresh: Fresh, trained: Fresh, inputs, tmp_path: Path, config: AdapterConfig
 ) -> None:
     model, resumed = trained(config), fresh()
@@ -209,7 +211,7 @@ def test_loaded_into_the_adapter_that_is_on_it_is_not_wrapped_twice(
 
 @both_types
 @both_kinds
-def test_merged_it_predicts_the_same_and_is_a_plain_model_again(
+def test_merged_model_predicts_the_same_and_is_a_plain_model(
     trained: Fresh, inputs, tmp_path: Path, config: AdapterConfig, dtype: torch.dtype
 ) -> None:
     model = trained(config, dtype)
@@ -225,7 +227,7 @@ def test_merged_it_predicts_the_same_and_is_a_plain_model_again(
     assert torch.equal(predict(WorldModel.from_pretrained(tmp_path / "merged"), inputs), predict(model, inputs))
 
 
-def test_merging_under_autocast_is_merging(trained: Fresh) -> None:
+def test_merge_under_autocast_equals_merge_without_autocast(trained: Fresh) -> None:
     model, other = trained(LORA), trained(LORA)
     merge_adapter(model)
     with torch.autocast("cpu", torch.bfloat16):
@@ -242,9 +244,9 @@ def test_merged_copy_has_the_encoder_fingerprint_of_the_original(trained: Fresh)
     assert merged.encoder_fingerprint() == model.encoder_fingerprint()
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of the libraries' own loaders
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # raised by the libraries' own loaders
 @every_method
-def test_plain_peft_loads_it_on_the_predictor(
+def test_peft_loads_a_saved_adapter_on_the_predictor(
     fresh: Fresh, trained: Fresh, inputs, tmp_path: Path, config: AdapterConfig
 ) -> None:
     fresh().save_pretrained(tmp_path / "base")
@@ -254,11 +256,11 @@ def test_plain_peft_loads_it_on_the_predictor(
     plain = peft.PeftModel.from_pretrained(predictor, str(tmp_path / "adapter"))
     with torch.no_grad():
         expected = model.predictor(inputs.latents, inputs.actions, inputs.states)
-        found = plain.eval()(inputs.latents, inputs.actions, inputs.states)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+        predicted = plain.eval()(inputs.latents, inputs.actions, inputs.states)
+    torch.testing.assert_close(predicted, expected, rtol=0, atol=1e-6)
 
 
-def test_an_adapter_of_another_base_is_refused(fresh: Fresh, sizes: ModelSizes, tmp_path: Path) -> None:
+def test_adapter_of_another_base_model_raises(fresh: Fresh, sizes: ModelSizes, tmp_path: Path) -> None:
     model = fresh(seed=0)
     add_adapter(model, LORA, seed=0)
     save_trained(model, tmp_path)
@@ -281,7 +283,7 @@ def truncate(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("damage", "message"),
     [
         (lambda folder: (folder / "vjepa2_ac.json").unlink(), r"vjepa2_ac\.json: cannot be read: No such"),
         (lambda folder: (folder / "vjepa2_ac.json").write_text("[]"), r"vjepa2_ac\.json: a JSON list"),
@@ -291,12 +293,12 @@ def truncate(folder: Path) -> None:
     ],
 )
 def test_incomplete_adapter_folder_raises_with_its_path(
-    fresh: Fresh, tmp_path: Path, spoil: Callable[[Path], object], message: str
+    fresh: Fresh, tmp_path: Path, damage: Callable[[Path], object], message: str
 ) -> None:
     model = fresh()
     add_adapter(model, LORA, seed=0)
     save_trained(model, tmp_path)
-    spoil(tmp_path)
+    damage(tmp_path)
     with pytest.raises(InputError, match=message):
         load_trained(fresh(), tmp_path)
 
@@ -306,10 +308,10 @@ def test_incomplete_adapter_folder_raises_with_its_path(
     [
         (LORA.model_copy(update={"rank": 2}), r"an adapter with rank 4\. Expected 2, as in the model"),
         (LORA.model_copy(update={"targets": ("q",)}), r"with targets \('fc1', .*Expected \('q',\)"),
-        (EVERYTHING, r"an adapter of kind lora, and the model has one of kind none"),
+        (FULL, r"an adapter of kind lora, and the model has one of kind none"),
     ],
 )
-def test_an_adapter_unlike_the_one_that_is_on_is_refused(
+def test_loading_into_an_adapter_with_another_config_raises(
     fresh: Fresh, tmp_path: Path, config: AdapterConfig, message: str
 ) -> None:
     model, other = fresh(), fresh()

@@ -1,4 +1,4 @@
-"""Encoders of both families: the official code's own numbers, every form of file, and what is never silently wrong."""
+"""Encoders of both families: equality with the official code, all file formats, and errors for wrong files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def golden(request: pytest.FixtureRequest) -> Golden:
 
 
 def model_of(path: Path | str, size: int = 96, dtype: str = "float32", **encoder: Any) -> WorldModel:
-    """Return a model with the encoder of a file, and a small fresh predictor."""
+    """Return a model with the encoder in a file, and a small new predictor."""
     known = {"heads": PUBLISHED_HEADS[path]} if path in PUBLISHED_HEADS else {}
     config = {
         "base": "random",
@@ -52,32 +52,32 @@ def model_of(path: Path | str, size: int = 96, dtype: str = "float32", **encoder
     return load_base(ModelConfig.model_validate(config), seed=0)
 
 
-def test_features_and_latents_equal_the_official_ones_at_every_size(golden: Golden) -> None:
+def test_features_and_latents_equal_the_official_values_at_every_size(golden: Golden) -> None:
     for size in map(int, golden.facts["sizes_px"]):
         model, io = model_of(golden.path, size), golden.io
         assert_equal_to_rounding(model.loaded_encoder(io[f"frames.{size}"]), io[f"tubelet.{size}"])
         assert_equal_to_rounding(model.encode(io[f"frames.{size}"][None])[0], io[f"latents.{size}"])
 
 
-def test_the_image_path_equals_the_official_one_at_every_size() -> None:
+def test_image_path_equals_the_official_values_at_every_size() -> None:
     io = load_file(V21.with_suffix(".io.safetensors"))
     for size in (96, 80, 256):
         model = model_of(V21, size, frame="image")
         assert_equal_to_rounding(model.loaded_encoder(io[f"frames.{size}"]), io[f"image.{size}"])
 
 
-def test_another_key_is_another_encoder(golden: Golden) -> None:
+def test_another_key_loads_another_encoder(golden: Golden) -> None:
     name = next(name for name in golden.io if name.startswith("other_key_tubelet."))
     size = int(name.rpartition(".")[2])
     model = model_of(golden.path, size, key="encoder")
     assert_equal_to_rounding(model.loaded_encoder(golden.io[f"frames.{size}"]), golden.io[name])
-    usual = model_of(golden.path, size)
-    assert model.encoder_fingerprint() != usual.encoder_fingerprint()
-    assert usual.encoder_origin is not None
-    assert usual.encoder_origin.key == golden.facts["checkpoint"]["encoder_key"]
+    default = model_of(golden.path, size)
+    assert model.encoder_fingerprint() != default.encoder_fingerprint()
+    assert default.encoder_origin is not None
+    assert default.encoder_origin.key == golden.facts["checkpoint"]["encoder_key"]
 
 
-# Every other form of file gives the same latents.
+# All other file formats give the same latents.
 
 
 def as_plain(weights: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -98,7 +98,7 @@ Named = Callable[[dict[str, Tensor]], dict[str, Tensor]]
 
 
 def write_transformers(folder: Path, named: Named = as_plain, shards: int = 1, **card: Any) -> Path:
-    """Write the golden of V-JEPA 2 as transformers does."""
+    """Write the reference encoder of V-JEPA 2 in the format of transformers."""
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps(CARD | card))
     weights = {name: value.clone() for name, value in named(dict(model_of(V2).encoder.state_dict())).items()}
@@ -106,13 +106,13 @@ def write_transformers(folder: Path, named: Named = as_plain, shards: int = 1, *
         save_file(weights, folder / "model.safetensors", metadata={"format": "pt"})
         return folder
     for shard in range(shards):
-        own = dict(list(weights.items())[shard::shards])
-        save_file(own, folder / f"model-{shard + 1:05}-of-{shards:05}.safetensors", metadata={"format": "pt"})
+        tensors = dict(list(weights.items())[shard::shards])
+        save_file(tensors, folder / f"model-{shard + 1:05}-of-{shards:05}.safetensors", metadata={"format": "pt"})
     return folder
 
 
 @pytest.mark.parametrize(("named", "shards"), [(as_plain, 1), (as_plain, 3)])
-def test_a_transformers_folder_is_the_same_encoder(tmp_path: Path, named: Named, shards: int) -> None:
+def test_transformers_folder_loads_the_same_encoder(tmp_path: Path, named: Named, shards: int) -> None:
     model, original = model_of(write_transformers(tmp_path / "hf", named, shards)), model_of(V2)
     assert model.sizes == original.sizes
     assert model.encoder_fingerprint() == original.encoder_fingerprint()
@@ -120,19 +120,21 @@ def test_a_transformers_folder_is_the_same_encoder(tmp_path: Path, named: Named,
     assert torch.equal(model.encode(frames), original.encode(frames))
 
 
-def test_transformers_own_class_reads_and_computes_the_same(tmp_path: Path) -> None:
-    """So the folder of these tests is in the true format."""
+def test_transformers_model_class_gives_equal_features(tmp_path: Path) -> None:
+    """This confirms that the folder written by these tests has the format of transformers."""
     from transformers import VJEPA2Model
 
     folder = write_transformers(tmp_path / "hf", only_encoder)
     theirs = VJEPA2Model.from_pretrained(folder).eval()
     frames = load_file(V2.with_suffix(".io.safetensors"))["frames.96"]
     with torch.no_grad():
-        found = theirs(frames[:, None].expand(-1, 2, -1, -1, -1), skip_predictor=True).last_hidden_state
-    assert_equal_to_rounding(model_of(folder).loaded_encoder(frames), found)
+        expected = theirs(frames[:, None].expand(-1, 2, -1, -1, -1), skip_predictor=True).last_hidden_state
+    assert_equal_to_rounding(model_of(folder).loaded_encoder(frames), expected)
 
 
-def test_the_same_from_the_hub_and_then_without_a_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_encoder_on_the_hub_loads_also_from_the_cache_without_a_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from huggingface_hub import constants
 
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
@@ -140,34 +142,34 @@ def test_the_same_from_the_hub_and_then_without_a_network(tmp_path: Path, monkey
         model = model_of("hf://facebook/tiny")
         assert model.encoder_fingerprint() == model_of(V2).encoder_fingerprint()
         assert str(model.encoder_origin) == "hf://facebook/tiny"
-        for wrong, said in (
+        for wrong, message in (
             ("facebook/none", "does not exist"),
             ("facebook/tiny@v9", "model or revision does not exist"),
         ):
-            with pytest.raises(RefusedError, match=said):
+            with pytest.raises(RefusedError, match=message):
                 model_of(f"hf://{wrong}")
-    again = model_of("hf://facebook/tiny")  # out of the cache
-    assert again.encoder_fingerprint() == model.encoder_fingerprint()
+    cached = model_of("hf://facebook/tiny")  # from the cache
+    assert cached.encoder_fingerprint() == model.encoder_fingerprint()
     with pytest.raises(UnreachableError, match="the Hub cannot be reached"):
         model_of("hf://facebook/other")
 
 
 @pytest.mark.parametrize("frame", ["tubelet", "image"])
-def test_a_folder_of_this_project_and_an_official_file_bring_it_back(
+def test_saved_folder_and_exported_official_file_load_the_same_encoder(
     golden: Golden, tmp_path: Path, frame: str
 ) -> None:
     if frame == "image" and not golden.is_newer:
         return
     model = model_of(golden.path, frame=frame)
     model.save_pretrained(tmp_path / "model")
-    again = WorldModel.from_pretrained(tmp_path / "model")
-    assert again.sizes == model.sizes
-    assert again.encoder_origin == model.encoder_origin
-    assert again.encoder_fingerprint() == model.encoder_fingerprint()
-    under_another = model_of(tmp_path / "model", frame=frame)
-    assert under_another.encoder_fingerprint() == model.encoder_fingerprint()
+    loaded = WorldModel.from_pretrained(tmp_path / "model")
+    assert loaded.sizes == model.sizes
+    assert loaded.encoder_origin == model.encoder_origin
+    assert loaded.encoder_fingerprint() == model.encoder_fingerprint()
+    with_new_predictor = model_of(tmp_path / "model", frame=frame)
+    assert with_new_predictor.encoder_fingerprint() == model.encoder_fingerprint()
     frames = golden.io["frames.96"][None]
-    assert torch.equal(under_another.encode(frames), model.encode(frames))
+    assert torch.equal(with_new_predictor.encode(frames), model.encode(frames))
     torch.save(to_official(model), tmp_path / "official.pt")
     official = load_official(tmp_path / "official.pt", model.sizes)
     assert official.sizes == model.sizes
@@ -175,28 +177,28 @@ def test_a_folder_of_this_project_and_an_official_file_bring_it_back(
         assert torch.equal(value, model.state_dict()[name]), name
 
 
-def test_an_official_file_has_metas_names_for_every_tensor(golden: Golden) -> None:
-    whole = torch.load(golden.path, weights_only=True)
-    theirs = whole[golden.facts["checkpoint"]["encoder_key"]]
+def test_exported_official_file_has_metas_name_for_every_tensor(golden: Golden) -> None:
+    content = torch.load(golden.path, weights_only=True)
+    theirs = content[golden.facts["checkpoint"]["encoder_key"]]
     ours = to_official(model_of(golden.path))["encoder"]
     assert {name.removeprefix("module.") for name in ours} == {name.removeprefix("module.backbone.") for name in theirs}
     for name, value in ours.items():
         assert torch.equal(value, theirs[name.replace("module.", "module.backbone.", 1)]), name
 
 
-# What would be wrong without an error is refused, with the way out.
+# Wrong files and configs raise, with a fix.
 
 
 P = "module.backbone."
 
 
-def without_last_norm(whole: dict[str, Any]) -> None:
+def without_last_norm(content: dict[str, Any]) -> None:
     for kind in ("weight", "bias"):
-        del whole["ema_encoder"][f"{P}norms_block.3.{kind}"]
+        del content["ema_encoder"][f"{P}norms_block.3.{kind}"]
 
 
-def with_another_tensor(whole: dict[str, Any]) -> None:
-    whole["ema_encoder"][f"{P}cls_token"] = torch.zeros(1, 1, 64)
+def with_another_tensor(content: dict[str, Any]) -> None:
+    content["ema_encoder"][f"{P}cls_token"] = torch.zeros(1, 1, 64)
 
 
 @pytest.mark.parametrize(
@@ -222,7 +224,7 @@ def test_incomplete_encoder_file_raises(tmp_path: Path, change: Any, message: st
         (V2, {"key": "ema_encoder"}, r"no ema_encoder .*Set model.encoder.key"),
     ],
 )
-def test_a_config_that_contradicts_the_file_is_refused(path: Path, encoder: dict[str, Any], message: str) -> None:
+def test_encoder_config_that_contradicts_the_file_raises(path: Path, encoder: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         model_of(path, **encoder)
 
@@ -237,11 +239,11 @@ def test_a_config_that_contradicts_the_file_is_refused(path: Path, encoder: dict
         ({"hidden_size": 10**9}, "hidden_size"),
     ],
 )
-def test_a_transformers_folder_that_says_something_else_is_refused(
+def test_transformers_config_that_contradicts_the_tensors_raises(
     tmp_path: Path, card: dict[str, Any], message: str
 ) -> None:
     folder = write_transformers(tmp_path / "hf", **card)
-    if card == {"num_attention_heads": 4}:  # which the tensors do not contradict: so it is another fingerprint
+    if card == {"num_attention_heads": 4}:  # the tensors do not contradict it, so that only the fingerprint differs
         assert model_of(folder).encoder_fingerprint() != model_of(V2).encoder_fingerprint()
         return
     with pytest.raises(InputError, match=message):
@@ -253,48 +255,46 @@ def test_pretraining_checkpoint_as_base_raises() -> None:
         load_base(ModelConfig(base=str(V21)), seed=0)
 
 
-def test_two_encoders_of_the_same_tensors_and_other_latents_are_two() -> None:
-    usual = model_of(V21).encoder_fingerprint()
-    assert model_of(V21, frame="image").encoder_fingerprint() != usual
-    assert model_of(V21, heads=2).encoder_fingerprint() != usual
+def test_fingerprint_differs_if_latents_differ_with_equal_tensors() -> None:
+    original = model_of(V21).encoder_fingerprint()
+    assert model_of(V21, frame="image").encoder_fingerprint() != original
+    assert model_of(V21, heads=2).encoder_fingerprint() != original
     published = WorldModel.empty(ModelSizes(encoder=EncoderSizes(width=1024, depth=1, heads=16)))
     published.encoder_origin = EncoderOrigin("vitl.pt")
-    assert not published.encoder_properties, "as of the AC file that holds it"
-    untold = WorldModel.empty(ModelSizes(encoder=EncoderSizes(width=48, depth=1, heads=3)))
-    assert not untold.encoder_properties, "of a model of before"
+    assert not published.encoder_properties, "a published number of heads must not change the fingerprint"
+    without_origin = WorldModel.empty(ModelSizes(encoder=EncoderSizes(width=48, depth=1, heads=3)))
+    assert not without_origin.encoder_properties, "the fingerprint of older models must not change"
 
 
-def test_the_encoder_of_a_model_stays_the_same_encoder_under_another_predictor() -> None:
-    """So its decoder and its caches fit."""
-    own = WorldModel.from_pretrained(find_base("builtin:sim-tiny"))
-    assert model_of("builtin:sim-tiny").encoder_fingerprint() == own.encoder_fingerprint()
+def test_encoder_of_a_model_has_the_same_fingerprint_with_a_new_predictor() -> None:
+    """The decoder and the caches of the model can therefore be used with the new predictor."""
+    model = WorldModel.from_pretrained(find_base("builtin:sim-tiny"))
+    assert model_of("builtin:sim-tiny").encoder_fingerprint() == model.encoder_fingerprint()
 
 
 # Features of an earlier block.
 
 
-def test_an_earlier_layer_gives_the_features_after_that_block_from_a_smaller_network(
-    golden: Golden, tmp_path: Path
-) -> None:
+def test_layer_option_returns_the_features_after_that_block(golden: Golden, tmp_path: Path) -> None:
     whole, frames = model_of(golden.path), golden.io["frames.96"]
-    depth, seen = whole.sizes.encoder.depth, list[Tensor]()
+    depth, outputs = whole.sizes.encoder.depth, list[Tensor]()
     layer = 2 * depth // 3
     hook = whole.loaded_encoder.vit.layer[layer - 1].register_forward_hook(
-        lambda _, __, out: seen.append(out[0] if isinstance(out, tuple) else out)
+        lambda _, __, out: outputs.append(out[0] if isinstance(out, tuple) else out)
     )
     whole.encode(frames[None])
     hook.remove()
-    expected = torch.nn.functional.layer_norm(seen[0], seen[0].shape[-1:], eps=1e-6)
-    cut = model_of(golden.path, layer=layer)
-    assert len(cut.loaded_encoder.vit.layer) == cut.sizes.encoder.depth == layer < depth
-    assert_equal_to_rounding(cut.encode(frames[None])[0], expected)
-    assert cut.encoder_fingerprint() != whole.encoder_fingerprint()
-    cut.save_pretrained(tmp_path / "cut")
-    again = load_base(ModelConfig(base=str(tmp_path / "cut"), dtype="float32"), seed=0)
-    torch.testing.assert_close(again.encode(frames[None]), cut.encode(frames[None]), rtol=0, atol=0)
-    of_folder = model_of(tmp_path / "cut", layer=layer - 1)
+    expected = torch.nn.functional.layer_norm(outputs[0], outputs[0].shape[-1:], eps=1e-6)
+    truncated = model_of(golden.path, layer=layer)
+    assert len(truncated.loaded_encoder.vit.layer) == truncated.sizes.encoder.depth == layer < depth
+    assert_equal_to_rounding(truncated.encode(frames[None])[0], expected)
+    assert truncated.encoder_fingerprint() != whole.encoder_fingerprint()
+    truncated.save_pretrained(tmp_path / "cut")
+    loaded = load_base(ModelConfig(base=str(tmp_path / "cut"), dtype="float32"), seed=0)
+    torch.testing.assert_close(loaded.encode(frames[None]), truncated.encode(frames[None]), rtol=0, atol=0)
+    from_folder = model_of(tmp_path / "cut", layer=layer - 1)
     torch.testing.assert_close(
-        of_folder.encode(frames[None]), model_of(golden.path, layer=layer - 1).encode(frames[None]), rtol=0, atol=0
+        from_folder.encode(frames[None]), model_of(golden.path, layer=layer - 1).encode(frames[None]), rtol=0, atol=0
     )
     last = model_of(golden.path, layer=depth)
     torch.testing.assert_close(last.encode(frames[None]), whole.encode(frames[None]), rtol=0, atol=0)

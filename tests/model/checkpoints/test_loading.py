@@ -1,4 +1,4 @@
-"""`model.base`: found, or reported missing with a fix; and a predictor without states in Meta's layout."""
+"""Loading `model.base`: folders, missing models, and a predictor without states in Meta's format."""
 
 import logging
 from pathlib import Path
@@ -21,19 +21,21 @@ OUTSIDE = ("predictor_embed", "action_encoder", "predictor_norm", "predictor_pro
 
 
 def names_in_file(depth: int) -> set[str]:
-    """Return the names of its tensors, each twice: weight and bias."""
+    """Return the names of all tensors in the file: weight and bias of each layer."""
     inside = [f"predictor_blocks.{index}.{part}" for index in range(depth) for part in BLOCK]
     return {f"module.{name}.{kind}" for name in (*OUTSIDE, *inside) for kind in ("weight", "bias")}
 
 
 def write_predictor_file(path: Path, model: WorldModel) -> Path:
-    """Write the predictor of a model without states; optimizer and scaler are there, and hold nothing of use."""
-    ours: dict[str, Tensor] = model.predictor.state_dict()
+    """Write the predictor of a model without states, with optimizer and scaler states that must be ignored."""
+    state: dict[str, Tensor] = model.predictor.state_dict()
     weights: dict[str, Tensor] = {}
     for name in names_in_file(model.sizes.predictor.depth):
-        own = name.removeprefix("module.").replace("predictor_blocks.", "blocks.").replace(".attn.proj.", ".attn.o.")
-        thirds = [own.replace(".qkv.", f".{part}.") for part in "qkv"] if ".qkv." in own else [own]
-        weights[name] = torch.cat([ours[one] for one in thirds])
+        our_name = (
+            name.removeprefix("module.").replace("predictor_blocks.", "blocks.").replace(".attn.proj.", ".attn.o.")
+        )
+        thirds = [our_name.replace(".qkv.", f".{part}.") for part in "qkv"] if ".qkv." in our_name else [our_name]
+        weights[name] = torch.cat([state[third] for third in thirds])
     moments = {index: {"step": torch.tensor(9.0), "exp_avg": value} for index, value in enumerate(weights.values())}
     opt = {"state": moments, "param_groups": [{"lr": 1e-4, "params": list(moments)}]}
     torch.save({"predictor": weights, "opt": opt, "scaler": None, "epoch": 9}, path)
@@ -44,15 +46,15 @@ def load_with(base: Path | str, sizes: SizesConfig) -> WorldModel:
     return load_base(ModelConfig(base=str(base), sizes=sizes, dtype="float32"), seed=0)
 
 
-def test_sizes_that_a_folder_does_not_have_are_refused_by_name(model: WorldModel, tmp_path: Path) -> None:
+def test_sizes_that_contradict_a_model_folder_raise_with_their_keys(model: WorldModel, tmp_path: Path) -> None:
     model.save_pretrained(tmp_path / "model")
     sizes = {"image_size": 64, "encoder": {"depth": 2, "heads": 4}, "predictor": {"width": 36, "heads": 3}}
-    given = SizesConfig.model_validate(sizes)
+    configured = SizesConfig.model_validate(sizes)
     with pytest.raises(InputError, match=r"image_size 48, and model\.sizes has 64, encoder\.heads 2, and .* 4"):
-        load_with(tmp_path / "model", given)
+        load_with(tmp_path / "model", configured)
 
 
-def test_a_folder_that_is_no_model_gives_the_command_that_makes_one_of_a_run(tmp_path: Path) -> None:
+def test_folder_without_a_model_raises_with_the_export_command(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"config\.json: cannot be read: No such.*`vjepa2-ac export RUN FOLDER`"):
         load_with(tmp_path, SizesConfig())
 
@@ -83,7 +85,7 @@ def encoder(tmp_path: Path) -> Path:
 
 
 def loaded(file: Path, encoder: Path, **settings: Any) -> WorldModel:
-    sizes = {"image_size": 48, "predictor": {"width": 36, "heads": 3}}  # as tensors do not show
+    sizes = {"image_size": 48, "predictor": {"width": 36, "heads": 3}}  # the tensors do not determine them
     config = {"base": str(file), "encoder": {"path": str(encoder)}, "sizes": sizes, "dtype": "float32", **settings}
     return load_base(ModelConfig.model_validate(config), seed=0)
 
@@ -94,9 +96,9 @@ def test_loaded_model_predicts_as_the_saved_one_and_logs_its_licence_once(
     with caplog.at_level(logging.WARNING):
         model = loaded(file, encoder)
     assert model.sizes == MODEL.sizes
-    given = draw(1, 3, 9, 24), draw(1, 3, 7), draw(1, 3, 7)
+    inputs = draw(1, 3, 9, 24), draw(1, 3, 7), draw(1, 3, 7)
     with torch.no_grad():
-        assert torch.equal(model.predict(*given), MODEL.predict(*given))
+        assert torch.equal(model.predict(*inputs), MODEL.predict(*inputs))
         frames = draw(1, 2, 3, 48, 48)
         assert torch.equal(model.encode(frames), MODEL.encode(frames))
     licence, unknown = (record.getMessage() for record in caplog.records)
@@ -105,7 +107,7 @@ def test_loaded_model_predicts_as_the_saved_one_and_logs_its_licence_once(
     assert f"{file} does not record the encoder of its predictor" in unknown
 
 
-def test_what_does_not_fit_is_refused(file: Path, encoder: Path, tmp_path: Path) -> None:
+def test_predictor_file_that_does_not_fit_raises(file: Path, encoder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"predictor\.use_extrinsics|predictor: 2 tensors do not match"):
         loaded(file, encoder, sizes={"image_size": 48, "predictor": {"width": 36, "heads": 3, "use_extrinsics": True}})
     with pytest.raises(InputError, match=r"no encoder \(keys: predictor, opt, scaler, epoch\)"):
@@ -125,8 +127,8 @@ def test_what_does_not_fit_is_refused(file: Path, encoder: Path, tmp_path: Path)
         loaded(tmp_path / "wider", encoder)
     with pytest.raises(InputError, match=r"a model with an encoder, and model.encoder sets another one"):
         loaded(GOLDEN / "model" / "tiny.pt", encoder)
-    whole = torch.load(file, weights_only=True)
-    whole["predictor"]["module.predictor_proj.bias"][0] = float("nan")
-    torch.save(whole, file)
+    content = torch.load(file, weights_only=True)
+    content["predictor"]["module.predictor_proj.bias"][0] = float("nan")
+    torch.save(content, file)
     with pytest.raises(InputError, match=r"predictor_proj\.bias contains NaN"):
         loaded(file, encoder)

@@ -1,4 +1,4 @@
-"""Official checkpoints: the official code's own numbers for both references, and validation of the file."""
+"""Official checkpoints: equality with the results of the official code, and validation of the file."""
 
 import io
 import json
@@ -48,7 +48,7 @@ def reference(request: pytest.FixtureRequest) -> Reference:
 
 
 def predictions(reference: Reference) -> tuple[Tensor, Tensor, Tensor]:
-    """Return latents, teacher-forced predictions, and the rollout that starts with the first of them."""
+    """Return latents, teacher-forced predictions, and the rollout that starts with the first prediction."""
     io, model = reference.io, reference.model
     cameras = io.get("extrinsics")
     z = model.encode(io["clips"].transpose(1, 2))
@@ -63,7 +63,7 @@ def predictions(reference: Reference) -> tuple[Tensor, Tensor, Tensor]:
     return z, forced, torch.cat([forced[:, :1], rolled], dim=1)
 
 
-def test_features_equal_the_official_ones(reference: Reference) -> None:
+def test_features_equal_the_official_values(reference: Reference) -> None:
     frames = reference.io["clips"].transpose(1, 2)
     raw = reference.model.encoder(frames.flatten(0, 1))
     assert_equal_to_rounding(raw.reshape(reference.io["features_raw"].shape), reference.io["features_raw"])
@@ -71,7 +71,7 @@ def test_features_equal_the_official_ones(reference: Reference) -> None:
 
 
 @pytest.mark.parametrize("attention", ["dense", "per_step"])
-def test_predictions_losses_and_gradients_equal_the_official_ones(reference: Reference, attention: str) -> None:
+def test_predictions_losses_and_gradients_equal_the_official_values(reference: Reference, attention: str) -> None:
     model, io, facts = reference.model, reference.io, reference.facts
     model.set_attention(attention)
     model.predictor.requires_grad_(True)
@@ -93,30 +93,30 @@ def check_gradients(model: WorldModel, io: dict[str, Tensor], norm: float) -> No
         if value.grad is not None:
             official, third = to_official_name(name, "predictor")
             fused.setdefault(official, {})[third] = value.grad
-    whole = {n: g[None] if None in g else torch.cat([g[0], g[1], g[2]]) for n, g in fused.items()}
+    content = {n: g[None] if None in g else torch.cat([g[0], g[1], g[2]]) for n, g in fused.items()}
     expected = {name.removeprefix("grad."): value for name, value in io.items() if name.startswith("grad.")}
     assert len(expected) >= 20
     for name, value in expected.items():
-        assert_equal_to_rounding(whole[name], value)
-    total = torch.stack([gradient.norm() for gradient in whole.values()]).norm().item()
+        assert_equal_to_rounding(content[name], value)
+    total = torch.stack([gradient.norm() for gradient in content.values()]).norm().item()
     assert total == pytest.approx(norm, rel=1e-5)
 
 
-def test_official_weights_go_out_as_they_came_in(reference: Reference) -> None:
-    whole = torch.load(reference.path, weights_only=True)
+def test_exported_official_checkpoint_equals_the_loaded_file(reference: Reference) -> None:
+    content = torch.load(reference.path, weights_only=True)
     exported = to_official(reference.model)
     for part in ("encoder", "target_encoder", "predictor"):
-        assert exported[part].keys() == whole[part].keys()
-        assert all(torch.equal(exported[part][name], value) for name, value in whole[part].items())
+        assert exported[part].keys() == content[part].keys()
+        assert all(torch.equal(exported[part][name], value) for name, value in content[part].items())
 
 
 TINY_SIZES = ModelSizes(image_size=64, encoder=EncoderSizes(heads=2), predictor=PredictorSizes(heads=4))
-Whole = dict[str, Any]
+Content = dict[str, Any]
 
 
 @pytest.fixture
-def rewritten(tmp_path: Path) -> Callable[[Callable[[Whole], Any]], Path]:
-    """Write the tiny checkpoint, changed by a function of what is in it."""
+def rewritten(tmp_path: Path) -> Callable[[Callable[[Content], Any]], Path]:
+    """Return a function that writes the tiny checkpoint with changed content."""
     return lambda change: rewrite(GOLDEN / "model" / "tiny.pt", change, tmp_path / "changed.pt")
 
 
@@ -125,11 +125,11 @@ def renamed(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("prefix", ["", "module.backbone.", "module._orig_mod.backbone."])
-def test_prefixes_in_any_order_and_an_unused_pos_embed_are_no_obstacle(rewritten, prefix: str) -> None:
-    def change(whole: Whole) -> None:
+def test_name_prefixes_and_an_unused_pos_embed_are_ignored(rewritten, prefix: str) -> None:
+    def change(content: Content) -> None:
         for part in ("encoder", "target_encoder", "predictor"):
-            whole[part] = renamed(whole[part], prefix)
-        whole["target_encoder"][prefix + "pos_embed"] = torch.zeros(1, 16, 48)
+            content[part] = renamed(content[part], prefix)
+        content["target_encoder"][prefix + "pos_embed"] = torch.zeros(1, 16, 48)
 
     model = load_official(rewritten(change), TINY_SIZES)
     assert (
@@ -137,32 +137,32 @@ def test_prefixes_in_any_order_and_an_unused_pos_embed_are_no_obstacle(rewritten
     )
 
 
-# Two encoders in a file.
+# Files with two encoders.
 
 
-def trained_encoder(whole: Whole) -> None:
-    """As in training, every value of every tensor differs from that of the target a little."""
+def trained_encoder(content: Content) -> None:
+    """Add an encoder whose values differ slightly from those of the target encoder, as after training."""
     generator = torch.Generator().manual_seed(1)
-    whole["encoder"] = {
+    content["encoder"] = {
         name: value * (1 + 0.01 * torch.randn(value.shape, generator=generator))
-        for name, value in whole["target_encoder"].items()
+        for name, value in content["target_encoder"].items()
     }
 
 
-@pytest.mark.parametrize("change", [trained_encoder, lambda whole: whole.pop("encoder") and None])
-def test_the_target_encoder_is_used_whatever_the_other_encoder_is(rewritten, change: Callable[[Whole], None]) -> None:
+@pytest.mark.parametrize("change", [trained_encoder, lambda content: content.pop("encoder") and None])
+def test_target_encoder_is_used_with_or_without_another_encoder(rewritten, change: Callable[[Content], None]) -> None:
     expected = load_official(GOLDEN / "model" / "tiny.pt", TINY_SIZES)
     model = load_official(rewritten(change), TINY_SIZES)
     assert model.encoder_fingerprint() == expected.encoder_fingerprint()
 
 
-def rename_one(whole: Whole) -> None:
-    for part in (whole["encoder"], whole["target_encoder"]):
+def rename_one(content: Content) -> None:
+    for part in (content["encoder"], content["target_encoder"]):
         part["module.blocks.1.norm1.scale"] = part.pop("module.blocks.1.norm1.weight")
 
 
-def drop_head(whole: Whole) -> None:
-    del whole["predictor"]["module.state_encoder.weight"]
+def drop_head(content: Content) -> None:
+    del content["predictor"]["module.state_encoder.weight"]
 
 
 @pytest.mark.parametrize(
@@ -174,15 +174,17 @@ def drop_head(whole: Whole) -> None:
         ),
         (drop_head, r"predictor: 1 tensors do not match \(missing: state_encoder.weight\)"),
         (lambda _: [1, 2], "changed.pt: a list. Expected a checkpoint of V-JEPA"),
-        (lambda whole: {"encoder": whole["encoder"]}, r"no predictor \(keys: encoder\)\. Expected both parts"),
-        (lambda whole: whole["predictor"], r"no encoder \(keys: module\.\w+\..*Expected both parts.*torch\.save\("),
+        (lambda content: {"encoder": content["encoder"]}, r"no predictor \(keys: encoder\)\. Expected both parts"),
+        (lambda content: content["predictor"], r"no encoder \(keys: module\.\w+\..*Expected both parts.*torch\.save\("),
         (
-            lambda whole: whole | {"predictor": renamed(whole["predictor"], "model.")},
+            lambda content: content | {"predictor": renamed(content["predictor"], "model.")},
             r"no tensor 'action_encoder.weight' in predictor \(its tensors: model\.\w+\.",
         ),
     ],
 )
-def test_a_checkpoint_that_does_not_fit_is_explained(rewritten, change: Callable[[Whole], Any], message: str) -> None:
+def test_checkpoint_with_wrong_tensors_raises_with_their_names(
+    rewritten, change: Callable[[Content], Any], message: str
+) -> None:
     with pytest.raises(InputError, match=message):
         load_official(rewritten(change), TINY_SIZES)
 
@@ -197,14 +199,14 @@ def test_a_checkpoint_that_does_not_fit_is_explained(rewritten, change: Callable
         ),
     ],
 )
-def test_sizes_that_contradict_the_tensors_are_refused(sizes: ModelSizes, message: str) -> None:
+def test_sizes_that_contradict_the_tensors_raise(sizes: ModelSizes, message: str) -> None:
     with pytest.raises(InputError, match=message):
         load_official(GOLDEN / "model" / "tiny.pt", sizes)
 
 
-def test_a_truncated_and_a_missing_file_are_refused(tmp_path: Path) -> None:
-    whole = (GOLDEN / "model" / "tiny.pt").read_bytes()
-    (tmp_path / "cut.pt").write_bytes(whole[: len(whole) // 2])
+def test_truncated_or_missing_file_raises(tmp_path: Path) -> None:
+    content = (GOLDEN / "model" / "tiny.pt").read_bytes()
+    (tmp_path / "cut.pt").write_bytes(content[: len(content) // 2])
     with pytest.raises(InputError, match=r"cut\.pt: 0.00 GB, beginning with b.PK.*truncated"):
         load_official(tmp_path / "cut.pt", TINY_SIZES)
     with pytest.raises(InputError, match=r"none\.pt: cannot be read: No such file"):
@@ -212,55 +214,55 @@ def test_a_truncated_and_a_missing_file_are_refused(tmp_path: Path) -> None:
 
 
 class Hostile:
-    """Runs a command of the system where it is unpickled."""
+    """An object that executes a system call when it is unpickled."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return os.mkdir, ("it-was-executed",)
+        return os.mkdir, ("executed",)
 
 
-def in_the_old_format(value: object) -> bytes:
+def save_in_old_format(value: object) -> bytes:
     file = io.BytesIO()
     torch.save(value, file, _use_new_zipfile_serialization=False)
     return file.getvalue()
 
 
-def in_the_new_format(value: object) -> bytes:
+def save_in_new_format(value: object) -> bytes:
     file = io.BytesIO()
     torch.save(value, file)
     return file.getvalue()
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (b"", "beginning with b''"),
         (b"version https://git-lfs.github.com/spec/v1\noid", "a git-lfs pointer"),
         (b"<!DOCTYPE html><html>not found</html>", "beginning with b'<!DOCTYPE html>"),
         (pickle.dumps({"encoder": Hostile()}), "that torch cannot read"),
-        (in_the_new_format({"encoder": Hostile()}), r"would call posix\.mkdir, which could execute code"),
-        (in_the_old_format({"encoder": Hostile()}), "that torch cannot read"),
+        (save_in_new_format({"encoder": Hostile()}), r"would call posix\.mkdir, which could execute code"),
+        (save_in_old_format({"encoder": Hostile()}), "that torch cannot read"),
     ],
 )
-def test_a_file_that_is_no_checkpoint_shows_how_it_begins_and_is_never_executed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes, said: str
+def test_invalid_file_raises_with_its_first_bytes_and_is_not_executed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("a.pt").write_bytes(content)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         load_official("a.pt", TINY_SIZES)
-    assert not Path("it-was-executed").exists()
+    assert not Path("executed").exists()
 
 
 @pytest.mark.parametrize("value", [np.float64(0.3), Path("here")], ids=["numpy", "path"])
-def test_a_file_with_other_objects_prints_the_command_that_saves_its_weights_alone(
+def test_file_with_other_objects_raises_with_the_command_that_extracts_its_weights(
     rewritten, tmp_path: Path, value: object
 ) -> None:
-    path = rewritten(lambda whole: whole | {"loss": value}).rename(tmp_path / "it's mine.pt")
+    path = rewritten(lambda content: content | {"loss": value}).rename(tmp_path / "it's mine.pt")
     with pytest.raises(InputError, match=r"would call .*If you trust the file, .*: `python -c ") as caught:
         load_official(path, TINY_SIZES)
     python, option, code = shlex.split(str(caught.value).partition("`")[2].rpartition("`")[0])
     assert (python, option) == ("python", "-c")
-    exec(code, {})  # noqa: S102 - a user pastes it
+    exec(code, {})  # noqa: S102 - the user would run this command
     model = load_official(tmp_path / "it's mine.weights.pt", TINY_SIZES)
     expected = load_official(GOLDEN / "model" / "tiny.pt", TINY_SIZES)
     assert model.encoder_fingerprint() == expected.encoder_fingerprint()

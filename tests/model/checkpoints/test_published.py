@@ -1,4 +1,4 @@
-"""The published checkpoints: their names cannot be mistaken; a file arrives whole, or not at all."""
+"""Published checkpoints: names are unique, and a file appears only after a complete download."""
 
 import re
 import threading
@@ -17,12 +17,16 @@ from vjepa2_ac.model.model_files import PUBLISHED, VIT_B, Published, download, f
 from vjepa2_ac.storage.retries import RetryPolicy
 
 
-def test_every_name_of_a_file_leads_to_it_and_no_two_files_collide() -> None:
-    assert len({one.file.casefold() for one in PUBLISHED}) == len({one.url for one in PUBLISHED}) == len(PUBLISHED)
-    for one in PUBLISHED:
-        for name in (one.name, one.file, one.remote, one.remote.removesuffix(".pt")):
-            assert find_published(name) is one
-        assert one in {find_published_file(one.file), find_published_file(one.remote)}
+def test_every_published_file_is_found_by_each_of_its_unique_names() -> None:
+    assert (
+        len({published.file.casefold() for published in PUBLISHED})
+        == len({published.url for published in PUBLISHED})
+        == len(PUBLISHED)
+    )
+    for published in PUBLISHED:
+        for name in (published.name, published.file, published.remote, published.remote.removesuffix(".pt")):
+            assert find_published(name) is published
+        assert published in {find_published_file(published.file), find_published_file(published.remote)}
     with pytest.raises(InputError, match=r"no published checkpoint of this name.*--list"):
         find_published("VJEPA2_1_VITG_384")
 
@@ -38,14 +42,14 @@ PART = "made-up.pt.made-up.part"
 
 @dataclass
 class Behaviour:
-    """What the server does: how many bytes it sends before it hangs up, which answers come first, what it can."""
+    """The behaviour of a test server."""
 
     content: bytes = CONTENT
-    cut_after: list[int] = field(default_factory=list)
-    answers: list[int] = field(default_factory=list)
-    resumes: bool = True
-    says_size: bool = True
-    seen: list[int] = field(default_factory=list)  # where each request started
+    cut_after: list[int] = field(default_factory=list)  # number of bytes that each of the first requests gets
+    errors: list[int] = field(default_factory=list)  # status codes of the first requests
+    can_resume: bool = True  # whether the server supports Range requests
+    sends_size: bool = True  # whether it sends Content-Length
+    starts: list[int] = field(default_factory=list)  # the first byte of each request so far
 
 
 @pytest.fixture
@@ -68,10 +72,10 @@ def handler_for(behaviour: Behaviour) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             match = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
-            start = int(match[1]) if match and behaviour.resumes else 0
-            behaviour.seen.append(start)
-            if behaviour.answers:
-                self.send_error(behaviour.answers.pop(0))
+            start = int(match[1]) if match and behaviour.can_resume else 0
+            behaviour.starts.append(start)
+            if behaviour.errors:
+                self.send_error(behaviour.errors.pop(0))
                 return
             size = len(behaviour.content)
             if start >= size:
@@ -82,7 +86,7 @@ def handler_for(behaviour: Behaviour) -> type[BaseHTTPRequestHandler]:
             self.send_response(206 if start else 200)
             if start:
                 self.send_header("Content-Range", f"bytes {start}-{size - 1}/{size}")
-            if behaviour.says_size:
+            if behaviour.sends_size:
                 self.send_header("Content-Length", str(size - start))
             self.end_headers()
             end = start + behaviour.cut_after.pop(0) if behaviour.cut_after else size
@@ -94,38 +98,38 @@ def handler_for(behaviour: Behaviour) -> type[BaseHTTPRequestHandler]:
 
 
 @pytest.mark.parametrize(
-    ("part", "behaviour", "seen"),
+    ("part", "behaviour", "starts"),
     [
         (b"", Behaviour(cut_after=[1000, 5000]), [0, 1000, 6000]),
         (CONTENT, Behaviour(), None),
         (CONTENT + b"more", Behaviour(), None),
-        (b"", Behaviour(cut_after=[1000], resumes=False), [0, 0]),
-        (b"", Behaviour(answers=[503, 503]), None),
+        (b"", Behaviour(cut_after=[1000], can_resume=False), [0, 0]),
+        (b"", Behaviour(errors=[503, 503]), None),
     ],
-    ids=["resumed where it broke", "whole part", "longer part", "a server that cannot resume", "a busy server"],
+    ids=["interrupted", "complete partial file", "longer partial file", "server without Range", "busy server"],
 )
-def test_it_arrives_however_often_the_line_breaks(serve, tmp_path: Path, part, behaviour, seen) -> None:
+def test_download_completes_after_interruptions(serve, tmp_path: Path, part, behaviour, starts) -> None:
     if part:
         (tmp_path / "model.pt.part").write_bytes(part)
     assert download(serve(behaviour), tmp_path / "model.pt", policy=at_once).read_bytes() == CONTENT
-    assert seen in (None, behaviour.seen)
+    assert starts in (None, behaviour.starts)
 
 
-def test_a_part_from_an_earlier_call_is_gone_on_with(serve, tmp_path: Path) -> None:
+def test_download_resumes_the_partial_file_of_an_earlier_call(serve, tmp_path: Path) -> None:
     behaviour = Behaviour(cut_after=[1000, 0, 0])
     url = serve(behaviour)
     with pytest.raises(UnreachableError, match=r"2 attempts in .* failed.*1000 bytes are in .*model\.pt\.part"):
         download(url, tmp_path / "model.pt", policy=twice)
     assert not (tmp_path / "model.pt").exists()
     assert download(url, tmp_path / "model.pt").read_bytes() == CONTENT
-    assert behaviour.seen == [0, 1000, 1000, 1000]
+    assert behaviour.starts == [0, 1000, 1000, 1000]
 
 
-def test_a_refusal_is_final_and_no_network_is_said(serve, tmp_path: Path) -> None:
-    behaviour = Behaviour(answers=[404])
+def test_refusal_is_not_retried_and_a_missing_network_is_reported(serve, tmp_path: Path) -> None:
+    behaviour = Behaviour(errors=[404])
     with pytest.raises(UnreachableError, match=r"cannot be read \(HTTP 404: .*Not Found"):
         download(serve(behaviour), tmp_path / "model.pt", policy=at_once)
-    assert behaviour.seen == [0]
+    assert behaviour.starts == [0]
     with pytest.raises(UnreachableError, match=r"2 attempts in .* failed.*refused.* Check the network"):
         download("http://127.0.0.1:9/model.pt", tmp_path / "model.pt", policy=twice)
     assert list(tmp_path.iterdir()) == []
@@ -133,17 +137,17 @@ def test_a_refusal_is_final_and_no_network_is_said(serve, tmp_path: Path) -> Non
 
 def test_download_without_content_length_raises(serve, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"without Content-Length\. Expected the size of the file"):
-        download(serve(Behaviour(says_size=False)), tmp_path / "model.pt")
+        download(serve(Behaviour(sends_size=False)), tmp_path / "model.pt")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_less_than_the_published_file_is_not_taken_for_it(serve, tmp_path: Path) -> None:
+def test_response_smaller_than_the_published_file_raises_and_keeps_the_partial_file(serve, tmp_path: Path) -> None:
     part = tmp_path / PART
     part.write_bytes(CONTENT[:1000])
-    url = serve(Behaviour(content=b"please wait", resumes=False))
+    url = serve(Behaviour(content=b"please wait", can_resume=False))
     with pytest.raises(InputError, match=r"a file of 11 bytes\. Expected made-up, of 102,400 to 102,400 bytes.*proxy"):
         download(url, tmp_path / "made-up.pt", published=MADE_UP)
-    assert part.read_bytes() == CONTENT[:1000]  # hours of a good line are not thrown away
+    assert part.read_bytes() == CONTENT[:1000]  # the partial download is kept
     assert download(serve(Behaviour()), tmp_path / "made-up.pt", published=MADE_UP).read_bytes() == CONTENT
 
 
@@ -155,10 +159,10 @@ def test_existing_file_of_a_wrong_size_raises_with_its_path(serve, tmp_path: Pat
         download(url, path, published=MADE_UP)
     with pytest.raises(InputError, match=r"a folder\. Expected the name of a file"):
         download(url, tmp_path, published=MADE_UP)
-    assert behaviour.seen == []
+    assert behaviour.starts == []
 
 
-def test_disk_space_for_the_rest_is_checked_before_the_first_byte(
+def test_disk_space_for_the_remaining_bytes_is_checked_before_the_download(
     serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(storage, "free_bytes", lambda _: 101_399)  # one byte less than the rest of the file
@@ -188,10 +192,10 @@ def test_invalid_url_raises_without_retries(tmp_path: Path, url: str) -> None:
         download(url, tmp_path / "model.pt")
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, a disk that is always full")
 def test_full_disk_raises_without_retries(serve, tmp_path: Path) -> None:
     (tmp_path / "model.pt.part").symlink_to("/dev/full")
     behaviour = Behaviour()
     with pytest.raises(InputError, match=r"model\.pt\.part: cannot be written: No space left.*Free some space"):
         download(serve(behaviour), tmp_path / "model.pt")
-    assert behaviour.seen == [0]
+    assert behaviour.starts == [0]

@@ -40,7 +40,7 @@ def rotated_by_hand(x: list[float], places: tuple[int, int, int]) -> list[float]
 
 
 @pytest.mark.parametrize("head_dim", [12, 16, 64])
-def test_each_token_is_turned_by_its_time_row_and_column(head_dim: int) -> None:
+def test_each_token_is_rotated_by_its_time_row_and_column(head_dim: int) -> None:
     layout = TokenLayout(steps=3, grid=2, conditioning=2)
     x = torch.randn(1, layout.steps * layout.tokens_per_step, 1, head_dim, generator=torch.Generator().manual_seed(0))
     turned = rotate(x, rotary_tables(layout, head_dim, CPU))
@@ -52,13 +52,13 @@ def test_each_token_is_turned_by_its_time_row_and_column(head_dim: int) -> None:
         torch.testing.assert_close(turned[0, token, 0], expected, rtol=1e-5, atol=1e-6)
 
 
-def test_a_later_start_is_the_rest_of_a_longer_sequence() -> None:
+def test_tables_with_a_later_start_equal_the_end_of_a_longer_sequence() -> None:
     whole, rest = rotary_tables(TokenLayout(4, 3, 2), 12, CPU), rotary_tables(TokenLayout(3, 3, 2, start=1), 12, CPU)
     for longer, later in zip(whole, rest, strict=True):
         torch.testing.assert_close(later, longer[11:])
 
 
-def test_gradients_are_those_of_differences() -> None:
+def test_gradients_equal_numerical_gradients() -> None:
     tables = rotary_tables(TokenLayout(2, 2, 1), 14, torch.device("cpu"))
     tokens = torch.randn(1, 10, 2, 14, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     assert torch.autograd.gradcheck(lambda given: rotate(given, tables), tokens.requires_grad_())
@@ -77,7 +77,7 @@ def drawn(dtype: torch.dtype = torch.float32, steps: int = 4, device: str = "cpu
 
 
 @pytest.mark.filterwarnings("ignore:flex_attention called without torch.compile")  # eager on purpose: no compiler here
-def test_flex_gives_the_output_of_the_dense_mask() -> None:
+def test_flex_output_equals_that_of_the_dense_mask() -> None:
     inputs = [value.detach() for value in drawn()]
     found = block_causal_attention(*inputs, PER_STEP, "flex")
     whole = block_causal_attention(*inputs, PER_STEP, "dense")
@@ -97,7 +97,7 @@ def assert_near(found: list[Tensor], expected: list[Tensor], share: float) -> No
 @pytest.mark.parametrize("dtype", list(ROUNDING), ids=str)
 @pytest.mark.parametrize("kind", ["flex", "per_step", "auto"])
 @pytest.mark.parametrize("device", ["cpu", ON_CUDA])
-def test_every_way_agrees_at_the_lengths_that_training_has(
+def test_implementations_agree_at_training_lengths(
     device: str, kind: AttentionKind, dtype: torch.dtype, last: int
 ) -> None:
     if kind == "flex" and device == "cpu":
@@ -119,7 +119,7 @@ def test_every_way_agrees_at_the_lengths_that_training_has(
 @pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
 @pytest.mark.parametrize("device", ["cpu", ON_CUDA])
 @pytest.mark.parametrize("kind", ["per_step", "flex"])
-def test_attention_between_compiled_halves_and_computed_again_is_the_plain_one(
+def test_attention_of_a_compiled_and_checkpointed_block_equals_the_dense_one(
     request: pytest.FixtureRequest, kind: AttentionKind, device: str
 ) -> None:
     if device == "cpu":
@@ -167,7 +167,7 @@ def test_too_many_flex_compilations_raise_with_a_fix() -> None:
 
 
 @pytest.mark.parametrize("kind", ["dense", "per_step"])
-def test_a_step_sees_itself_and_the_past_but_not_the_future(kind: AttentionKind) -> None:
+def test_steps_attend_to_themselves_and_earlier_steps_only(kind: AttentionKind) -> None:
     query, key, value = (x.detach() for x in drawn())
     before = block_causal_attention(query, key, value, PER_STEP, kind)
     changed = value.clone()

@@ -50,9 +50,7 @@ def assert_same(found: list[Tensor], expected: list[Tensor], tolerance: float = 
         assert (one - other).norm() <= tolerance * other.norm()
 
 
-def test_compiled_steps_are_the_plain_ones_and_nothing_is_compiled_again_after_the_first(
-    sizes: ModelSizes, inputs
-) -> None:
+def test_compiled_steps_equal_uncompiled_ones_without_recompilation(sizes: ModelSizes, inputs) -> None:
     model, batch = adapted(sizes), clips(inputs)
     names = list(model.state_dict())
     expected = loss_and_gradients(model, batch, compiled=False)

@@ -73,7 +73,7 @@ def test_only_input_heads_of_other_widths_are_replaced_and_reported(widths: Widt
     assert predict(model, widths).shape == (1, 3, 4, 24)
 
 
-def test_a_fresh_head_that_would_not_be_trained_is_refused_with_the_line_to_add() -> None:
+def test_new_input_head_that_would_not_be_trained_raises_with_the_setting() -> None:
     plain = LORA.model_copy(update={"modules_to_save": ()})
     with pytest.raises(InputError, match=r"modules_to_save=\[action_encoder, state_encoder\]"):
         add_adapter(fitted(Widths(14, 14)), plain, seed=0)
@@ -102,7 +102,7 @@ def test_trained_input_heads_load_into_the_base_model(tmp_path: Path, config: Ad
 
 @both_kinds
 @widths
-def test_merged_it_is_a_base_of_its_own_that_folders_keep(
+def test_merged_model_with_new_input_heads_loads_as_a_base_model(
     tmp_path: Path, config: AdapterConfig, widths: Widths
 ) -> None:
     model = trained(widths, config)

@@ -20,7 +20,7 @@ WIDE = ModelSizes(
 )
 
 
-def test_a_prediction_depends_on_its_own_and_earlier_steps_only(model: WorldModel, inputs) -> None:
+def test_predictions_depend_on_their_own_and_earlier_steps_only(model: WorldModel, inputs) -> None:
     before = model.predict(inputs.latents, inputs.actions, inputs.states)
     for name in ("latents", "actions", "states"):
         changed = {"latents": inputs.latents, "actions": inputs.actions, "states": inputs.states}
@@ -32,7 +32,7 @@ def test_a_prediction_depends_on_its_own_and_earlier_steps_only(model: WorldMode
 
 
 @pytest.mark.parametrize("by_transformers", [True, False])
-def test_output_layers_start_smaller_the_deeper_they_are(by_transformers: bool) -> None:
+def test_initial_output_weights_shrink_with_depth(by_transformers: bool) -> None:
     predictor = new_predictor(WIDE)
     if not by_transformers:
         predictor.initialise(torch.Generator().manual_seed(0))
@@ -48,7 +48,7 @@ def test_output_layers_start_smaller_the_deeper_they_are(by_transformers: bool) 
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of transformers' own loader
-def test_transformers_loads_the_predictor_by_itself(model: WorldModel, tmp_path: Path, inputs) -> None:
+def test_transformers_loads_a_saved_predictor(model: WorldModel, tmp_path: Path, inputs) -> None:
     model.save_pretrained(tmp_path / "model")
     alone = ActionConditionedPredictor.from_pretrained(tmp_path / "model" / "predictor")
     expected = model.predictor(inputs.latents, inputs.actions, inputs.states)
@@ -97,7 +97,7 @@ def assert_same(found: list[Tensor], expected: list[Tensor], tolerance: float = 
 
 @pytest.mark.parametrize("parts", PARTS)
 @pytest.mark.parametrize(("extrinsics", "checkpointing"), [(False, False), (True, True)])
-def test_steps_in_parts_give_the_predictions_and_gradients_of_all_at_once(
+def test_cached_steps_give_the_predictions_and_gradients_of_a_single_pass(
     sizes: ModelSizes, inputs, parts: tuple[int, ...], extrinsics: bool, checkpointing: bool
 ) -> None:
     model = adapted(sizes, extrinsics=extrinsics)
@@ -118,7 +118,7 @@ def plain_rollout(model: WorldModel, context: Tensor, actions: Tensor, states: T
 
 @pytest.mark.parametrize("context", [1, 3])
 @torch.no_grad()
-def test_a_rollout_is_the_one_that_computes_everything_again(sizes: ModelSizes, inputs, context: int) -> None:
+def test_rollout_equals_a_rollout_without_a_cache(sizes: ModelSizes, inputs, context: int) -> None:
     model = adapted(sizes)
     given = (inputs.latents[:, :context], inputs.actions, inputs.states)
     torch.testing.assert_close(model.rollout(*given), plain_rollout(model, *given), rtol=1e-5, atol=1e-5)

@@ -52,7 +52,7 @@ def predicted_by_hand(full: WorldModel, latents: Tensor, actions: Tensor, camera
 @both
 @pytest.mark.parametrize("attention", ["dense", "per_step"])
 @torch.no_grad()
-def test_predictions_are_those_of_the_model_with_states_whose_state_tokens_are_cut_out(
+def test_predictions_equal_those_of_a_model_with_states_after_removing_state_tokens(
     extrinsics: bool, attention: str
 ) -> None:
     full, cut = pair(extrinsics=extrinsics)
@@ -65,7 +65,7 @@ def test_predictions_are_those_of_the_model_with_states_whose_state_tokens_are_c
 
 @both
 @torch.no_grad()
-def test_other_states_of_any_width_change_no_bit(extrinsics: bool) -> None:
+def test_states_of_any_value_and_width_do_not_change_predictions(extrinsics: bool) -> None:
     cut = pair(extrinsics=extrinsics)[1]
     latents, actions, states, *cameras = inputs(extrinsics=extrinsics)
     expected = cut.predict(latents, actions, states, *cameras)
@@ -76,7 +76,7 @@ def test_other_states_of_any_width_change_no_bit(extrinsics: bool) -> None:
     assert not torch.equal(cut.predict(latents, actions + 1, states, *cameras), expected)
 
 
-def test_an_adapter_on_the_missing_layer_is_refused() -> None:
+def test_adapter_on_the_missing_state_encoder_raises() -> None:
     with pytest.raises(
         InputError, match=r"modules_to_save: state_encoder, which a predictor without states does not have"
     ):
@@ -86,7 +86,7 @@ def test_an_adapter_on_the_missing_layer_is_refused() -> None:
 
 
 @pytest.mark.parametrize("width", [1, 7, 14])
-def test_states_of_any_width_fit_and_other_actions_get_a_fresh_head(width: int, tmp_path: Path) -> None:
+def test_states_of_any_width_fit_and_other_action_widths_get_a_new_head(width: int, tmp_path: Path) -> None:
     model = tiny_model(states=False)
     assert find_heads_to_replace(model.sizes, Widths(width, 7)) == ()
     assert fit_heads(model, Widths(width, 7), seed=0) == []

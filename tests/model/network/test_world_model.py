@@ -18,7 +18,7 @@ from vjepa2_ac.model.world_model import WorldModel
 Fresh = Callable[..., WorldModel]
 
 
-def test_the_same_seed_gives_the_same_model_and_another_seed_another(fresh: Fresh) -> None:
+def test_seed_determines_the_weights(fresh: Fresh) -> None:
     torch.manual_seed(5)
     model = fresh(seed=3)
     torch.manual_seed(6)
@@ -26,12 +26,12 @@ def test_the_same_seed_gives_the_same_model_and_another_seed_another(fresh: Fres
     assert model.encoder_fingerprint() == fresh(seed=3).encoder_fingerprint() != fresh(4).encoder_fingerprint()
 
 
-def test_a_context_longer_than_the_actions_is_refused(model: WorldModel, inputs) -> None:
+def test_context_longer_than_the_actions_raises(model: WorldModel, inputs) -> None:
     with pytest.raises(ValueError, match="2 actions do not reach the end of a context of 3"):
         model.rollout(inputs.latents[:, :3], inputs.actions[:, :2], inputs.states[:, :2])
 
 
-def test_a_saved_model_is_the_same_when_it_is_loaded(model: WorldModel, tmp_path: Path, inputs) -> None:
+def test_saved_model_gives_equal_outputs_after_loading(model: WorldModel, tmp_path: Path, inputs) -> None:
     model.save_pretrained(tmp_path / "model")
     loaded = WorldModel.from_pretrained(tmp_path / "model")
     assert loaded.sizes == model.sizes
@@ -71,7 +71,7 @@ def test_incomplete_model_folder_raises_with_its_path(
         WorldModel.from_pretrained(tmp_path / "model")
 
 
-def test_a_model_whose_encoder_is_set_aside_predicts_as_before_and_knows_which_one_it_was(
+def test_model_without_its_encoder_predicts_as_before_and_keeps_the_fingerprint(
     model: WorldModel, fresh: Fresh, inputs, tmp_path: Path
 ) -> None:
     model.remove_encoder()
@@ -98,7 +98,7 @@ def test_a_model_whose_encoder_is_set_aside_predicts_as_before_and_knows_which_o
         (None, "sizes: Input should be"),
     ],
 )
-def test_a_folder_that_claims_absurd_sizes_is_refused_before_anything_is_made(
+def test_folder_with_absurd_sizes_raises_before_memory_is_allocated(
     model: WorldModel, tmp_path: Path, sizes: dict[str, Any] | None, complaint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model.save_pretrained(tmp_path)
@@ -111,7 +111,7 @@ def test_a_folder_that_claims_absurd_sizes_is_refused_before_anything_is_made(
     assert caught.value.where == f"{tmp_path / 'config.json'}: sizes"
 
 
-def test_the_encoder_stays_frozen_and_in_eval_mode_while_the_model_trains(model: WorldModel, inputs) -> None:
+def test_encoder_stays_frozen_and_in_eval_mode_during_training(model: WorldModel, inputs) -> None:
     model.train()
     assert model.predictor.training
     assert not any(module.training for module in model.encoder.modules())
@@ -136,7 +136,7 @@ def likeness_to_the_input(model: WorldModel) -> Tensor:
 
 
 @pytest.mark.parametrize(("width", "least"), [(48, 0.95), (64, 0.95), (32, 0.7)])
-def test_a_predictor_that_starts_at_persistence_begins_close_to_copying(width: int, least: float) -> None:
+def test_initialisation_near_persistence_copies_the_input(width: int, least: float) -> None:
     copying = WorldModel.random(sizes(width), seed=0, near_persistence=True)
     released = WorldModel.random(sizes(width), seed=0)
     assert likeness_to_the_input(copying) > least
