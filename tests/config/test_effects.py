@@ -138,7 +138,7 @@ def world_model() -> WorldModel:
 
 @pytest.fixture
 def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str | None]]:
-    """Return the lookup keys of index, idle ranges and latents for a config; None if the data set rejects the config."""
+    """Return the lookup keys of index, idle ranges and latents for a config; None if the config is rejected."""
 
     def stop(_: Any, keys: Any, *__: Any, **___: Any) -> None:
         raise LookedUp(keys)

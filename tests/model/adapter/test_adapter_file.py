@@ -1,4 +1,4 @@
-"""Adapter files of unknown origin: converted to our config, or rejected with the name of the option; never read by PEFT."""
+"""Adapter files of unknown origin: converted to our config, or rejected by name of the option; never read by PEFT."""
 
 import json
 from collections.abc import Callable
