@@ -17,7 +17,7 @@ from vjepa2_ac.training.cost import count_parameters
 
 Load = Callable[[str], Any]
 SECTION = (ROOT / "docs/IMPLEMENTATION_NOTES.md").read_text().split("\n## GPU measurements\n")[1].split("\n## ")[0]
-ENCODERS = [one for one in PUBLISHED if one.holds == "encoder"]
+ENCODERS = [one for one in PUBLISHED if one.model_kind == "encoder"]
 
 
 @pytest.mark.parametrize(

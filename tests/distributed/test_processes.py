@@ -56,7 +56,7 @@ def test_two_processes_resumed_as_one_equal_a_single_process_run(without_dropout
         train(config, signalled_reporter(type(reporter)(), state.step + 1, signal.SIGUSR1))
     train(config, reporter)  # once more: the number of processes is not another any more, and a step not the config's
     assert reporter.steps[0] == state.step + 2
-    assert any("4 micro-batches of 2 in each" in note for note in reporter.notes)
+    assert any("computes 4 micro-batches of 2" in note for note in reporter.notes)
     assert_equal_up_to_rounding(whole, tmp_path / "shared")
 
 
@@ -90,7 +90,7 @@ def test_clips_of_a_step_do_not_depend_on_the_number_of_processes(
     config = make_config(training__batch_size=2, training__accumulation=4)
     state = RunState(step=3, processes=before, clips_per_step=8 * before, clips_per_process=8)
     assert count_micro_batches(config, state, now, reporter) * 2 == state.clips_per_step
-    assert [f"{each} micro-batches of 2 in each" in note for note in reporter.notes] == [True] * (each is not None)
+    assert [f"computes {each} micro-batches of 2" in note for note in reporter.notes] == [True] * (each is not None)
 
 
 def test_more_processes_than_micro_batches_raise(make_config, reporter) -> None:
