@@ -10,7 +10,7 @@ from matplotlib.image import imread
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.transforms import crop_box
-from vjepa2_ac.inspection.sheet import Strip, pictures_per_row, plot_contact_sheet
+from vjepa2_ac.inspection.sheet import Strip, num_images_per_row, plot_contact_sheet
 from vjepa2_ac.inspection.statistics import inspect_dataset
 
 pytestmark = pytest.mark.usefixtures("drawn")
@@ -32,15 +32,15 @@ def plotted(droid: Path, tmp_path: Path) -> Plotted:
 
 
 def strip(colour: tuple[int, int, int] = (200, 30, 40), *, steps: int = 30, size: tuple[int, int] = (18, 32)) -> Strip:
-    count = min(pictures_per_row(*size), steps)
+    count = min(num_images_per_row(*size), steps)
     return Strip(
         name="a/rather/long/name/of/an/episode" * 4,
         success=True,
         frames=np.full((count, *size, 3), colour, np.uint8),
         speed=np.linspace(0, 20, steps),
         closedness=np.linspace(0, 1, steps),
-        shaded=((0, 2),),
-        seen=crop_box(*size),
+        unused=((0, 2),),
+        crop=crop_box(*size),
     )
 
 
