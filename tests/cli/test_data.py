@@ -113,7 +113,7 @@ def test_inspect_prints_and_writes_statistics_and_a_figure(config: str, tmp_path
     words = ["data.stride=auto", "--out", str(out), "--limit", "4", "--rows", "1"]
     assert main(["data", "inspect", config, *words]) == 0
     printed = capsys.readouterr().out
-    for words in ("episodes", "standing still", "wrist_left", "candidate, 4"):
+    for words in ("episodes", "idle", "wrist_left", "candidate, 4"):
         assert words in printed
     read = json.loads((out / "inspect.json").read_text())
     assert (read["episodes"], read["sampled_episodes"]) == (8, 4)

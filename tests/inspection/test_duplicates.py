@@ -53,7 +53,7 @@ def test_a_far_set_of_which_nothing_tells_the_states_is_said_to_be_not_known(gcs
     found = find_duplicates(open_dataset(config))
     assert found == Duplicates(is_known=False)
     assert {one.about: one.level for one in check_data(config, clips=2)}["duplicates"] == "skipped"
-    assert str(found) == "need the states of the episodes; the index of this data set has none"
+    assert str(found) == "needs the states of the episodes in the index, found none"
 
 
 def test_those_across_splits_are_counted_and_two_of_them_are_named() -> None:

@@ -78,9 +78,14 @@ class Duplicates:
     example: tuple[tuple[str, Split], ...] = ()  # two copies with their splits, if possible in different splits
     copies: tuple[str, ...] = ()  # identities of all but the first episode of each recording
 
+    @property
+    def level(self) -> Level:
+        """The status of the check: a warning if there are copies."""
+        return "skipped" if not self.is_known else "warning" if self.episodes else "ok"
+
     def __str__(self) -> str:
         if not self.is_known:
-            return "need the states of the episodes; the index of this data set has none"
+            return "needs the states of the episodes in the index, found none"
         if not self.episodes:
             return "no two episodes have the same states"
         (first, first_split), (second, second_split) = self.example
@@ -112,14 +117,14 @@ def find_duplicates(dataset: Dataset) -> Duplicates:
     for number, member, split in zip(recordings.tolist(), members.tolist(), splits.tolist(), strict=True):
         groups[number].append((table.identity(member), SPLITS[split]))
     across = [group for group in groups.values() if len({split for _, split in group}) > 1]
-    first, *others = (across or list(groups.values()))[0]
-    other = next((one for one in others if one[1] != first[1]), others[0])
+    first, *copies = (across or list(groups.values()))[0]
+    second = next((copy for copy in copies if copy[1] != first[1]), copies[0])
     return Duplicates(
         is_known=True,
         episodes=len(members),
         different=len(groups),
         across=sum(map(len, across)),
-        example=(first, other),
+        example=(first, second),
         copies=tuple(name for group in groups.values() for name, _ in group[1:]),
     )
 
@@ -133,14 +138,12 @@ def _recordings(
     moving = np.flatnonzero(motion[:, SPANS].max(axis=1, initial=0.0) > _MOVING)  # without unknown motion
     points = np.column_stack([motion[moving, 2:], table.num_steps[members[moving]]])
     _, nearest = KDTree(points).query(points, k=_MOST_COPIES, p=np.inf, distance_upper_bound=_NEAR)
-    numbers[moving] = np.append(numbers[moving], len(members))[nearest].min(
-        axis=1
-    )  # the appended number stands for "no neighbour"
+    # The appended number is that of a missing neighbour.
+    numbers[moving] = np.append(numbers[moving], len(members))[nearest].min(axis=1)
     return np.asarray(numbers)
 
 
 def duplicates_finding(dataset: Dataset) -> Finding:
     """Return the finding about duplicated episodes."""
     duplicates = find_duplicates(dataset)
-    level: Level = "skipped" if not duplicates.is_known else "warning" if duplicates.episodes else "ok"
-    return Finding(level, "duplicates", str(duplicates))
+    return Finding(duplicates.level, "duplicates", str(duplicates))

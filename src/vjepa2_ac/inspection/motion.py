@@ -115,7 +115,7 @@ def _check_states(dataset: Dataset, sample: Sequence[ReadEpisode]) -> Iterator[F
     stretches = [
         Stretch(dataset.table.identity(one.index), start, one.states[start:end])
         for one in sample
-        for start, end in one.kept
+        for start, end in one.selected
         if end - start > 1
     ]
     yield speed_finding(stretches, dataset.control_rate_hz, checked + by_index)

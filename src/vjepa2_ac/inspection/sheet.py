@@ -75,7 +75,7 @@ def _read_strip(inspection: Inspection, sampled: ReadEpisode, name: str) -> Stri
     changes = np.gradient(sampled.states, axis=0) if num_steps > 1 else np.zeros_like(sampled.states)
     is_pose, space = inspection.has_poses, dataset.spaces.state
     is_unused = np.ones(num_steps, bool)
-    for start, end in sampled.kept:
+    for start, end in sampled.selected:
         is_unused[start:end] = False
     change = space.compute_display_size(changes) if is_pose else largest_change(changes, inspection.ranges)
     return Strip(

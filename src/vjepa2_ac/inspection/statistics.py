@@ -17,7 +17,7 @@ from vjepa2_ac.data.windows import candidate_strides
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.inspection.coverage import Coverage, ReadEpisode, coverage_by, coverage_findings, read_sample
-from vjepa2_ac.inspection.findings import SPLITS, Duplicates, find_duplicates
+from vjepa2_ac.inspection.findings import SPLITS, Duplicates, Finding, find_duplicates
 from vjepa2_ac.spaces import rotation_angles
 
 PERCENTILES = (10, 50, 90, 99)
@@ -87,13 +87,19 @@ class Inspection:
             "ranges": self.ranges.tolist(),
             "percentiles": list(PERCENTILES),
             "per_model_step": [
-                {"stride": stride, "seconds": stride / rate, **{name: _percentiles(one) for name, one in sizes.items()}}
+                {
+                    "stride": stride,
+                    "seconds": stride / rate,
+                    **{name: _percentiles(size) for name, size in sizes.items()},
+                }
                 for stride, sizes in self.steps.items()
             ],
             "coverage": None if self.coverage is None else dict(self.coverage.metrics),
         }
         if self.has_poses:
-            values["still_share"] = float(np.concatenate([idle_runs(one.states, config) for one in self.sample]).mean())
+            values["still_share"] = float(
+                np.concatenate([idle_runs(episode.states, config) for episode in self.sample]).mean()
+            )
         return values
 
     def _size_of(self, split: Split) -> dict[str, int]:
@@ -107,18 +113,22 @@ class Inspection:
     def summary(self) -> dict[str, str]:
         """The statistics as lines of text, by name."""
         config, values = self.dataset.config, self.values
-        hours, success, copies = values["hours"], values["success_share"], self.duplicates.copies
-        lasting = f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
-        lengths = " / ".join(map(str, values["length_percentiles_0_10_50_90_100"]))
-        sizes = {name: (counted(one["windows"], "clip"), one["episodes"]) for name, one in values["splits"].items()}
-        splits = ", ".join(f"{name} {clips} in {counted(count, 'episode')}" for name, (clips, count) in sizes.items())
-        removed = ", ".join(f"{one.name} {one}" for one in self.dataset.removed if one.episodes or one.steps)
-        known = f"of {counted(values['success_known_of'], 'episode')} of which it is known"
+        hours, success = values["hours"], values["success_share"]
+        duplicates = _with_status(Finding(self.duplicates.level, "duplicates", str(self.duplicates)))
+        copies = ". inspect.json lists the copies" if self.duplicates.copies else ""
+        duration = f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
+        shortest, short, median, long, longest = values["length_percentiles_0_10_50_90_100"]
+        splits = ", ".join(
+            f"{name} {counted(size['windows'], 'clip')} in {counted(size['episodes'], 'episode')}"
+            for name, size in values["splits"].items()
+        )
+        removals = [removal for removal in self.dataset.removed if removal.episodes or removal.steps]
+        num_known = counted(values["success_known_of"], "episode")
         ranges = [f"{low:.2f} to {high:.2f}" for low, high in self.ranges]
         if self.has_poses:
             about_states = {
-                "standing still": f"{values['still_share']:.1%} of the steps, by the measured motion",
-                "position": f"{', '.join(f'{axis} {one}' for axis, one in zip('xyz', ranges, strict=False))} m",
+                "idle": f"{100 * values['still_share']:.1f} % of the steps, by the measured motion",
+                "position": f"{', '.join(f'{axis} {limits}' for axis, limits in zip('xyz', ranges, strict=False))} m",
                 "gripper": f"{ranges[-1]} (0 open, 1 closed)",
             }
         else:
@@ -130,16 +140,18 @@ class Inspection:
         return {
             "data set": f"{config.path} ({config.source})",
             "episodes": f"{values['episodes']:,} ({values['broken_episodes']:,} broken)",
-            "steps": f"{values['steps']:,} at {values['control_rate_hz']:g} per second: {lasting}",
-            "length": f"{lengths} steps (least, 10 %, median, 90 %, most)",
+            "steps": f"{values['steps']:,} at {values['control_rate_hz']:g} Hz ({duration})",
+            "length": f"{shortest} to {longest} steps (percentiles: 10 % {short}, 50 % {median}, 90 % {long})",
             "cameras": f"{', '.join(values['cameras'])}; used: {', '.join(config.cameras)}",
-            "success": "not recorded" if success is None else f"{success:.1%} {known}",
-            "left out": removed or "no episodes and no steps",
+            "success": "not recorded"
+            if success is None
+            else f"{100 * success:.1f} % of {num_known} with a recorded outcome",
+            "filters": ", ".join(f"{removal.name} removes {removal}" for removal in removals) or "remove nothing",
             "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
-            "duplicates": f"{self.duplicates}{'; inspect.json lists the copies' if copies else ''}",
-            "sample": f"{counted(len(self.sample), 'episode')}, for what follows",
+            "duplicates": f"{duplicates}{copies}",
+            "sample": f"{counted(len(self.sample), 'episode')}; the following lines are measured on this sample",
             **about_states,
-            **{one.about: one.text for one in coverage_findings(self.coverage)},
+            **{finding.about: _with_status(finding) for finding in coverage_findings(self.coverage)},
         }
 
 
@@ -155,6 +167,11 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
         InputError: Episodes of the sample cannot be read, and `data.broken_episodes` does not skip them.
     """
     return Inspection(dataset, find_duplicates(dataset), tuple(read_sample(dataset, episodes, progress)))
+
+
+def _with_status(finding: Finding) -> str:
+    """Return the text of a finding, with its status in front unless it is ok."""
+    return finding.text if finding.level == "ok" else f"{finding.level}: {finding.text}"
 
 
 def _percentiles(values: Float[np.ndarray, " pairs"]) -> list[float]:

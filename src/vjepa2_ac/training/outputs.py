@@ -119,7 +119,7 @@ class RunOutputs:
             write_atomically(run.folder / CALIBRATION, json.dumps(run.calibration, indent=1).encode())
         measure_coverage = TRAINING_HOOKS.find("coverage")
         if not (run.folder / CHANGES).exists() and (coverage := measure_coverage(run.dataset)) is not None:
-            write_atomically(run.folder / CHANGES, json.dumps(coverage.noted()).encode())
+            write_atomically(run.folder / CHANGES, json.dumps(coverage.as_record()).encode())
         trackers = open_trackers(run.config, run.folder, run_id=run_id, first_step=step)
         metrics_log = DivergenceWarningLog(run.config, self._reporter, first_step=step, trackers=trackers)
         self.metrics_log = self._exit_stack.enter_context(metrics_log)
