@@ -127,7 +127,7 @@ def measure_clips(config: RldsData, clips: int, tfds_python: str | None) -> None
     names = ("every frame of every camera", "ours, first read of a record", "ours")
 
     def first_reads(position: int) -> None:
-        with patch.object(rlds_source, "_is_marked", return_value=False):  # no record was checked before
+        with patch.object(rlds_source, "_is_checked", return_value=False):  # no record was checked before
             later_reads(position)
 
     ways = (everything, first_reads, later_reads)
