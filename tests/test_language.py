@@ -38,7 +38,10 @@ NAMES = "found|one|ones|its|told|tells|asked|asks|kept|there|wanted|others|taken
 ALLOWED_NAMES: set[str] = set()
 MOST_WORDS = 30  # in a sentence of a page
 
-PAGES = [*(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")), *sorted(ROOT.glob("docs/*.md"))]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")),
+    *sorted(ROOT.glob("docs/*.md")),
+]
 MODULES = sorted((ROOT / "src").rglob("*.py"))
 ASSETS = [
     path
