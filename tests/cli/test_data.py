@@ -67,7 +67,7 @@ def test_check_with_json_prints_one_object_with_the_same_findings(
     ]
     assert bool(printed["variants"]) == bool(words)
     if words:
-        assert printed["variants"][0]["name"] == "as they are"
+        assert printed["variants"][0]["name"] == "unchanged"
         assert {"value", "low", "high"} == printed["variants"][1]["difference"].keys()
 
 
@@ -139,7 +139,7 @@ def test_calibrate_prints_a_table_and_writes_its_metrics(config: str, tmp_path: 
     arguments = ["data", "calibrate", config, "data.stride=auto", "--out", str(out), "--limit", "4"]
     assert main(arguments) == 0
     printed = capsys.readouterr().out
-    assert "Best: stride" in printed
+    assert "Best stride" in printed
     read = json.loads((out / "calibration.json").read_text())
     assert [row["stride"] for row in read["strides"]] == [4, 8, 15]
     assert read["stride"] in {4, 8, 15}
@@ -154,7 +154,7 @@ def test_axes_are_fitted_written_and_drawn_and_a_model_that_knows_none_is_told(
     arguments = ["data", "calibrate", config, "--axes", "builtin:sim-tiny", "--limit", "12", "--out", str(out)]
     assert main(arguments) == 1
     printed = capsys.readouterr().out
-    assert "Not to plan by: " in printed
+    assert "Not usable for planning: " in printed
     read = json.loads((out / "axes.json").read_text())
     assert read["pairs"] == 12
     assert read["problem"] in " ".join(printed.split())

@@ -54,13 +54,13 @@ def test_the_angle_of_a_turned_oracle_is_recovered_within_half_a_degree(degrees:
 
 
 def test_a_model_that_ignores_actions_is_refused() -> None:
-    assert (fitted(Copier()).problem or "").startswith("no better than none")
+    assert (fitted(Copier()).problem or "").startswith("no significant improvement")
 
 
 def test_a_turn_that_predicts_no_better_than_none_and_one_of_a_wide_interval_are_refused() -> None:
     found = fitted_to_turned(-60.0)
     unsure = replace(found, error=Estimate(0.98, 0.95, 1.01))
-    assert (unsure.problem or "").startswith("no better than none")
+    assert (unsure.problem or "").startswith("no significant improvement")
     wide = replace(found, yaw_degrees=Estimate(-60.0, -80.0, -30.0))
     assert (wide.problem or "").startswith("uncertain: yaw -60 degrees, 95 % interval -80 to -30")
 
@@ -70,7 +70,7 @@ def test_mirrored_axes_and_one_episode_are_refused_by_name() -> None:
     batch = clips_batch(2)
     alone = infer_axes(Oracle(), [rollout_start(batch, clip, step) for clip in (0, 1) for step in range(TIME - 1)],
                        at_once=64)  # fmt: skip
-    assert "1 episode" in (alone.problem or "")
+    assert "found 1" in (alone.problem or "")
 
 
 class Placed(Turned):

@@ -54,7 +54,7 @@ def test_good_numbers_are_all_well() -> None:
         ("pixels", "error", "all pixels are 0", {"frames": torch.zeros_like(good()["frames"])}),
         ("pixels", "warning", "nearly black", {"frames": good()["frames"] // 100}),
         ("position", "error", "never changes", {"states": torch.zeros_like(good()["states"])}),
-        ("position", "warning", "in metres, from the base", {"states": good()["states"] * 8}),
+        ("position", "warning", "beyond the reach of most arms (1.6 m)", {"states": good()["states"] * 8}),
         ("position", "warning", "within 1 cm", {"states": good()["states"] * 0.01}),
         ("rotation", "warning", "never changes", {"actions": good()["actions"] * ONLY_MOVES}),
         ("rotation", "warning", "the rotation jumps", {"actions": good()["actions"] + TURNS_BY_2_5}),

@@ -113,7 +113,7 @@ def test_of_few_or_short_or_still_episodes_nothing_is_claimed(how: str) -> None:
         assert [finding.level for finding in findings if finding.about == "agreement"] == ["skipped"]
         assert "needs at least 8 moving episodes of 8 or more steps" in findings[-1].text
     (finding,) = found_in([(s[:1], f[:1]) for s, f in recorded()])
-    assert (finding.level, finding.text.split(", ")[1]) == ("skipped", "found 0 of 0 steps (median)")
+    assert (finding.level, finding.text.split(", ")[1]) == ("skipped", "found 0 (median 0 steps)")
 
 
 def config_of(path: Path, tmp_path: Path, **changes: object) -> DataConfig:

@@ -259,6 +259,6 @@ def test_rotation_format_of_the_numbers_is_named(tmp_path: Path, true: str, conf
     finding = findings_of(config)["rotation format"]
     assert finding.level == ("ok" if true == configured else "warning"), finding
     if true == configured:
-        assert f"if they are read as {true}, and in no other format" in finding.text
+        assert f"read as {true}, the rotation is smooth at" in finding.text
     else:
         assert finding.text.endswith(f"Set data.lerobot.rotation: {true}")

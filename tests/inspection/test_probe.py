@@ -18,7 +18,7 @@ from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.episode import Batch, Episode, LatentBatch, StepRanges
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.inspection.probe import (
-    AS_THEY_ARE,
+    UNCHANGED,
     VariantProbe,
     mirrored,
     probe_variants,
@@ -125,10 +125,10 @@ def probed(dataset: Dataset, model: Knowing | Copier | None = None) -> VariantPr
 FAULTS: dict[str, Fault] = {
     **{f"frames {n} step{'s' * (n > 1)} late": at(n) for n in (1, 8)},
     **{f"frames {n} step{'s' * (n > 1)} early": at(-n) for n in (2, 4)},
-    "the states backwards": lambda states: at(0)(states)[::-1].copy(),
+    "states reversed": lambda states: at(0)(states)[::-1].copy(),
     "x negated": lambda states: mirrored(at(0)(states), 0),
     "y negated": lambda states: mirrored(at(0)(states), 1),
-    "the gripper inverted": lambda states: with_inverted_gripper(at(0)(states)),
+    "gripper inverted": lambda states: with_inverted_gripper(at(0)(states)),
 }
 
 
@@ -138,7 +138,7 @@ def test_each_fault_is_named_and_mending_it_makes_the_model_fit(name: str) -> No
     assert probe.better is not None
     assert probe.better.name == name
     assert probe.better.ratio.value < 0.02 < 0.1 < probe.plain.ratio.value
-    assert probe.verdict().endswith(f" with {name}: {probe.better.repair}")
+    assert probe.verdict().endswith(f" lower for the variant '{name}'. To fix the data, {probe.better.repair}")
 
 
 @pytest.mark.parametrize("name", ["red and blue exchanged", "frames mirrored"])
@@ -155,14 +155,14 @@ def test_of_good_data_no_variant_fits_better_and_only_changed_frames_are_encoded
     assert probe.better is None
     assert probe.plain.ratio.value < 0.02
     assert min(one.difference.value for one in probe.results) > 0.1
-    assert probe.verdict().endswith("on 16 clips of 8 episodes; no variant fits better with certainty")
+    assert probe.verdict().endswith("on 16 clips from 8 episodes; no variant is significantly better")
     assert probe.is_decided
     assert knowing.encoded == 2 * 3  # two batches; again with red and blue exchanged, and mirrored
     assert {one.name for one in probe.results} >= {*FAULTS, "red and blue exchanged"}
 
 
 def test_of_few_episodes_nothing_is_claimed() -> None:
-    probe = probed(dataset_of(FAULTS["the states backwards"], episodes=4))
+    probe = probed(dataset_of(FAULTS["states reversed"], episodes=4))
     assert min(one.difference.value for one in probe.results) < -0.1
     assert probe.better is None
     assert probe.verdict().startswith("needs at least 5 episodes, found 4 (")
@@ -172,7 +172,7 @@ def test_of_few_episodes_nothing_is_claimed() -> None:
 def test_what_is_worse_than_persistence_is_no_better_reading() -> None:
     def found(ratio: Estimate) -> VariantResult | None:
         difference = Estimate(-0.2, -0.25, -0.15)
-        plain = VariantResult(AS_THEY_ARE, Estimate(1.3, 1.2, 1.4), 0.4, 0.3, clips=64, episodes=12)
+        plain = VariantResult(UNCHANGED, Estimate(1.3, 1.2, 1.4), 0.4, 0.3, clips=64, episodes=12)
         other = replace(plain, name="y negated", ratio=ratio, difference=difference)
         return VariantProbe(plain, (other,)).better
 
@@ -215,10 +215,10 @@ def test_vectors_are_shifted_and_turned_only_and_latents_keep_their_colours() ->
 
     shifted = {"frames 1 step late", "frames 1 step early"}
     colours = {"red and blue exchanged", "frames mirrored"}
-    poses = {"x negated", "y negated", "the gripper inverted"}
-    assert names() == shifted | colours | poses | {"the states backwards"}
-    assert names(source="latents") == shifted | poses | {"the states backwards"}
-    assert names(source="npz", states="vector") == shifted | colours | {"the states backwards"}
+    poses = {"x negated", "y negated", "gripper inverted"}
+    assert names() == shifted | colours | poses | {"states reversed"}
+    assert names(source="latents") == shifted | poses | {"states reversed"}
+    assert names(source="npz", states="vector") == shifted | colours | {"states reversed"}
     assert names(source="npz", states="vector", actions="recorded", join_actions="sum") == shifted | colours
 
 

@@ -41,13 +41,13 @@ def test_the_probe_prints_a_table_and_a_verdict_after_the_findings(
 ) -> None:
     assert check(make_config(), tmp_path, "builtin:sim-tiny") == 0
     printed = capsys.readouterr().out
-    findings, table = printed.split("One-step error / persistence of the data in variants")
+    findings, table = printed.split("One-step error relative to persistence, by variant of the data")
     assert "\nskipped  agreement" in findings
-    for variant in ("as they are", "frames 1 step late", "the states backwards", "y negated", "red and blue"):
+    for variant in ("unchanged", "frames 1 step late", "states reversed", "y negated", "red and blue"):
         assert variant in table
     summary, probe = table.splitlines()[-1], " ".join(table.split())
     assert "skipped probe needs a model that predicts these data better" in probe  # no drawings
-    assert "on 8 clips of 5 episodes" in probe
+    assert "on 8 clips from 5 episodes" in probe
     assert re.fullmatch(r"0 errors, \d warnings?, [1-9] skipped", summary)
 
 

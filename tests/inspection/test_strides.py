@@ -75,7 +75,7 @@ def test_the_stride_that_a_model_has_learned_is_found(learned: int) -> None:
     found = calibrated(GoesOn(learned), tracks([80] * 20, noise=0.1))
     assert found.stride == learned
     assert found.is_certain
-    assert "not certain" not in found.verdict()
+    assert "not significant" not in found.verdict()
 
 
 def test_ratios_are_those_computed_by_hand() -> None:
@@ -108,8 +108,8 @@ def test_a_model_that_does_nothing_is_certain_of_nothing() -> None:
     found = calibrated(GoesOn(0), tracks([80] * 6, noise=0.2))
     assert [one.ratio.value for one in found.results.values()] == [1.0, 1.0, 1.0]
     assert not found.is_certain
-    assert "not certain" in found.verdict()
-    assert "does it fit this data at all?" in found.verdict()
+    assert "not significant" in found.verdict()
+    assert "The model is not better than persistence at any stride" in found.verdict()
 
 
 def test_a_stride_that_fits_no_episode_is_named_and_the_others_are_measured() -> None:

@@ -30,12 +30,12 @@ def test_auto_stride_is_chosen_once_and_stored(
     chosen = json.loads((folder / "calibration.json").read_text())["stride"]
     assert chosen in {2, 3}
     assert read_run_config(folder).data.stride == chosen
-    assert any("Best: stride" in note for note in reporter.notes)
+    assert any("Best stride" in note for note in reporter.notes)
 
     monkeypatch.setattr("vjepa2_ac.inspection.variants.calibrate_model", lambda *_: pytest.fail("chosen again"))
     more = type(reporter)()
     train(config, more)  # the same config, auto still
-    assert not [note for note in more.notes if "Best: stride" in note]
+    assert not [note for note in more.notes if "Best stride" in note]
 
 
 def test_auto_stride_is_chosen_among_strides_that_fit_the_clips(

@@ -134,7 +134,7 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
             probe = probe_config(config, dataset, model=model, clips=2 * clips, progress=progress)
     variants = [] if probe is None else [probe.plain, *probe.results]
     if variants and not as_json:
-        cli.show(variants_table("One-step error / persistence of the data in variants", variants))
+        cli.show(variants_table("One-step error relative to persistence, by variant of the data", variants))
     if probe is not None:
         add(Finding("warning" if probe.better else "ok" if probe.is_decided else "skipped", "probe", probe.verdict()))
     if as_json:
@@ -156,7 +156,7 @@ def _inspect(options: argparse.Namespace) -> None:
     with cli.reporter() as reporter:
         dataset = at_some_stride(cli.open_data(config, reporter))
         if config.data.stride == "auto":
-            reporter.note(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
+            reporter.note(f"data.stride is auto: inspected at the smallest candidate, {dataset.config.stride}")
         inspection = inspect_dataset(dataset, episodes=options.episodes, progress=reporter.task("reading states"))
         cli.show(*(f"{name:<16}{text}" for name, text in inspection.summary.items()))
         values = cli.write_json(options.out / "inspect.json", inspection.values)
@@ -186,7 +186,7 @@ def _calibrate(options: argparse.Namespace) -> int:
         sample = ClipSample(options.split, options.limit or _CLIPS)
         calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
     path = cli.write_json(options.out / "calibration.json", calibration.as_dict())
-    title = f"One-step error / persistence on {options.split} episodes, {calibration.frames} frames a clip"
+    title = f"One-step error relative to persistence, {options.split} episodes, {calibration.frames} frames per clip"
     table = variants_table(title, list(calibration.results.values()), calibration.best)
     reasons = [f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()]
     cli.show(table, *reasons, calibration.verdict(), files=[path])

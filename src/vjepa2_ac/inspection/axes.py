@@ -58,24 +58,27 @@ class AxisFit:
         """The reason for which the result cannot be used for planning; None if it can be used."""
         yaw, half = self.yaw_degrees, (self.yaw_degrees.high - self.yaw_degrees.low) / 2
         if self.episodes < EPISODES_NEEDED:
-            return f"pairs of {self.episodes} episode, and an interval needs {EPISODES_NEEDED}"
+            return f"needs pairs from at least {EPISODES_NEEDED} episodes for an interval, found {self.episodes}"
         if _nearest_tried(yaw.value) != _UNTURNED and not self.error.high < 1.0:
-            return f"no better than none: squared error {self.error} of that without a turn"
+            return f"no significant improvement: squared error {self.error} relative to no rotation"
         if not half <= MOST_YAW_DEGREES:
-            return f"uncertain: yaw {yaw.value:.0f} degrees, 95 % interval {yaw.low:.0f} to {yaw.high:.0f}"
+            return (
+                f"uncertain: yaw {yaw.value:.0f} degrees, 95 % interval {yaw.low:.0f} to {yaw.high:.0f}"
+                f" (needs a half-width of at most {MOST_YAW_DEGREES:g})"
+            )
         return None
 
     def words(self) -> str:
         """Return the result as text, with the reason if it cannot be used for planning."""
         yaw, (x, y) = self.yaw_degrees, self.centre_m
         centre = f"the middle of its motion, x {x:.2f} y {y:.2f} m" if any(self.centre_m) else "its base"
-        between = f" (95 % interval {yaw.low:.0f} to {yaw.high:.0f})" if yaw.has_interval else ""
+        interval = f" (95 % interval {yaw.low:.0f} to {yaw.high:.0f})" if yaw.has_interval else ""
         text = (
-            f"The model predicts best if the robot's motion is turned by {yaw.value:+.1f} degrees about {centre}"
-            f"{between}: squared error {self.error} of that without a turn"
-            f" ({self.pairs} pairs of {counted(self.episodes, 'episode')})."
+            f"The model predicts best if the robot's motion is rotated by {yaw.value:+.1f} degrees about {centre}"
+            f"{interval}: squared error {self.error} relative to no rotation"
+            f" ({self.pairs} pairs of frames from {counted(self.episodes, 'episode')})."
         )
-        return text if self.problem is None else f"{text} Not to plan by: {self.problem}."
+        return text if self.problem is None else f"{text} Not usable for planning: {self.problem}."
 
     def as_dict(self) -> dict[str, Any]:
         """Return all numbers as plain values, for JSON."""
@@ -215,7 +218,7 @@ def calibrate_axes(
         for batch in validation_batches(dataset, split, clips=pairs, batch_size=config.validation.batch_size):
             latents = encode(batch)
             starts += [rollout_start(latents, row, 0) for row in range(len(batch.starts))]
-    fit = infer_axes(world_model, starts, config.planning.energy.samples_at_once, reporter.task("turning the axes"))
+    fit = infer_axes(world_model, starts, config.planning.energy.samples_at_once, reporter.task("rotating the axes"))
     data = config.data
     return fit, {
         "format": AXES_FORMAT,

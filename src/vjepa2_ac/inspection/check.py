@@ -70,9 +70,10 @@ def check_data(
 def _check_selection(dataset: Dataset) -> Iterator[Finding]:
     """Yield the findings about used episodes, splits, groups and copied episodes."""
     config = dataset.config
-    for one in dataset.removed:
-        if one.episodes or one.steps or one.windows:
-            yield Finding("warning" if one.name == "broken" else "ok", f"filter {one.name}", f"removes {one}")
+    for removal in dataset.removed:
+        if removal.episodes or removal.steps or removal.windows:
+            level: Level = "warning" if removal.name == "broken" else "ok"
+            yield Finding(level, f"filter {removal.name}", f"removes {removal}")
     for problem in dataset.table.problems[:3]:
         yield Finding("warning", "broken episode", f"{problem.where}: {problem.found}")
     if splits_used := describe_splits(dataset.table, config):
@@ -84,9 +85,7 @@ def _check_selection(dataset: Dataset) -> Iterator[Finding]:
         except InputError as error:
             if split == "train":
                 raise
-            level: Level = (
-                "error" if share else "skipped"
-            )  # training needs validation, and test if its share is above 0
+            level = "error" if share else "skipped"  # training needs validation, and test if its share is above 0
             yield Finding(level, split, f"{shorten(error.found, _LONGEST, placeholder=' …')}. {error.fix}")
             continue
         short = f"; {counted(len(windows.short), 'episode')} shorter than a clip" if len(windows.short) else ""
@@ -129,7 +128,9 @@ def _check_clips(dataset: Dataset, *, seed: int, batch_size: int, clips: int) ->
     rest_s = time.perf_counter() - started - first_s
     read = [batch for batch in batches if batch.starts]
     if not read:
-        yield Finding("error", "clips", f"none of {len(batches) * batch_size} could be read. See data.broken_episodes")
+        yield Finding(
+            "error", "clips", f"none of {len(batches) * batch_size} clips could be read. See data.broken_episodes"
+        )
         return
     yield from batch_findings(read, dataset.spaces)
     rate = sum(len(batch.starts) for batch in batches[1:]) / max(rest_s, 1e-9)
@@ -155,7 +156,7 @@ def batch_findings(batches: Sequence[Batch], spaces: Spaces = POSES) -> Iterator
     if first.latents is None:
         yield _pixel_finding(batches)
     else:
-        yield Finding("skipped", "frames", "needs frames; check the data set that this latent cache was made from")
+        yield Finding("skipped", "frames", "needs frames, found a latent cache. Check the data set it was made from")
     if spaces.state.position is None:
         yield _vector_finding("states", states, "Check which fields the state consists of")
         yield _vector_finding("actions", actions, "There is nothing to learn from")
@@ -170,7 +171,7 @@ def _pixel_finding(batches: Sequence[Batch]) -> Finding:
     mean = float(np.mean([batch.float().mean().item() for batch in frames]))
     return first_case(
         "pixels",
-        f"{low} to {high}, mean {mean:.0f}",
+        f"values {low} to {high}, mean {mean:.0f}",
         (low == high, "error", f"all pixels are {low}, so the frames show nothing. Check data.camera"),
         (mean < _DARK, "warning", "the frames are nearly black. Check data.camera"),
     )
@@ -201,36 +202,42 @@ def _pose_findings(
     positions, angles, closed = states[:, POSE.position], states[:, POSE.rotation], states[:, POSE.gripper]
     low, high = positions.min(axis=0), positions.max(axis=0)
     extent, reach = (high - low).max(), np.linalg.norm(positions, axis=1).max()
+    far = f"positions are up to {reach:.2f} m from the base, beyond the reach of most arms ({_REACH_M:g} m)"
     yield first_case(
         "position",
         ", ".join(f"{axis} {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", low, high, strict=True)) + " m",
         (extent == 0, "error", "the position never changes. Check which fields the state consists of"),
-        (reach > _REACH_M, "warning", "most arms do not reach as far. Check that it is in metres, from the base"),
+        (reach > _REACH_M, "warning", f"{far}. Check that they are in metres, from the base"),
         (extent < 0.01, "warning", "all positions are within 1 cm. Check that they are in metres"),
     )
     turned = np.rad2deg(rotation_angles(actions[:, POSE.rotation]))
+    turned_text = _percentiles(turned, ".1f", "degrees")
     yield first_case(
         "rotation",
-        f"angles {angles.min():.2f} to {angles.max():.2f} rad; degrees per model step: {_percentiles(turned, '.1f')}",
+        f"angles {angles.min():.2f} to {angles.max():.2f} rad; rotation per model step (percentiles): {turned_text}",
         (turned.max() == 0, "warning", "the rotation never changes. Check that the state contains it"),
         (np.percentile(turned, 90) > 90, "warning", "the rotation jumps. Check that angles are extrinsic xyz radians"),
     )
     yield first_case(
         "gripper",
         f"{closed.min():.2f} to {closed.max():.2f} (0 open, 1 closed)",
-        (np.ptp(closed) == 0, "warning", f"it never moves in {counted(clips, 'clip')}. Check that the state has it"),
+        (
+            np.ptp(closed) == 0,
+            "warning",
+            f"the gripper never moves in {counted(clips, 'clip')}. Check that the state contains it",
+        ),
         (closed.max() < _OPEN, "warning", "the gripper never closes. Check that it is 0 to 1, not a width in metres"),
     )
     moved = POSE.compute_display_size(actions)
     yield first_case(
         "actions",
-        f"cm per model step: {_percentiles(moved, '.2f')}",
+        f"motion per model step (percentiles): {_percentiles(moved, '.2f', 'cm')}",
         (not np.any(actions), "error", "all actions are zero. There is nothing to learn from"),
         (np.median(moved) < _STILL_CM, "warning", "the robot is nearly still. See data.idle, or raise data.stride"),
         (np.median(moved) > _FAR_CM, "warning", "the steps are long. Check the unit (metres), or lower data.stride"),
     )
 
 
-def _percentiles(values: Float[np.ndarray, " pairs"], form: str) -> str:
+def _percentiles(values: Float[np.ndarray, " pairs"], form: str, unit: str) -> str:
     numbers = np.percentile(values, list(PERCENTILES))
-    return ", ".join(f"{value:{form}} ({at} %)" for value, at in zip(numbers, PERCENTILES, strict=True))
+    return ", ".join(f"{value:{form}} {unit} ({at} %)" for value, at in zip(numbers, PERCENTILES, strict=True))

@@ -74,14 +74,14 @@ def excerpts_of(dataset: Dataset, *, episodes: int = EPISODES, steps: int = STEP
     """
 
     def read(index: int) -> Excerpt:
-        start, end = max(dataset.selected_steps.ranges_of(index), key=lambda one: one[1] - one[0])
+        start, end = max(dataset.selected_steps.ranges_of(index), key=lambda limits: limits[1] - limits[0])
         first = start + max(0, end - start - steps) // 2
         chosen = range(first, min(end, first + steps))
         episode = dataset.read(index)
         states = np.asarray(episode.states[chosen.start : chosen.stop], np.float64)
         return Excerpt(episode.info.id, states, small_grey(episode.read_frames(chosen)))
 
-    yield from (found for _, found in read_each(dataset, sample_of(dataset, episodes), read))
+    yield from (excerpt for _, excerpt in read_each(dataset, sample_of(dataset, episodes), read))
 
 
 def small_grey(frames: UInt8[np.ndarray, "steps height width 3"]) -> Float32[np.ndarray, "steps rows columns"]:
@@ -110,7 +110,7 @@ def check_excerpts(dataset: Dataset) -> Iterator[Finding]:
         InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
     """
     if dataset.config.is_cache:
-        yield Finding("skipped", "agreement", "needs frames; check the data set that this latent cache was made from")
+        yield Finding("skipped", "agreement", "needs frames, found a latent cache. Check the data set it was made from")
         return
     excerpts = list(excerpts_of(dataset, episodes=affordable(dataset)))
     yield from excerpt_findings(excerpts, dataset.spaces.state, dataset.config.model_stride, dataset.control_rate_hz)
@@ -120,7 +120,7 @@ def excerpt_findings(
     excerpts: Sequence[Excerpt], space: StateSpace, stride: int, control_rate_hz: float
 ) -> Iterator[Finding]:
     """Yield the findings about faults in excerpts, and the agreement of frames and states."""
-    excerpts = [one for one in excerpts if len(one.states) > 1 and np.ptp(one.grey) >= BLANK]
+    excerpts = [excerpt for excerpt in excerpts if len(excerpt.states) > 1 and np.ptp(excerpt.grey) >= BLANK]
     if not excerpts:
         yield _agreement([], stride, control_rate_hz, is_sound=True)
         return
@@ -129,13 +129,13 @@ def excerpt_findings(
     if space.position is not None:
         wrong += _deltas_for_poses(excerpts)
     yield from wrong
-    pairs = [(one, other.frame_change) for one, other in zip(moved, excerpts, strict=True)]
+    pairs = [(motion, excerpt.frame_change) for motion, excerpt in zip(moved, excerpts, strict=True)]
     yield _agreement(pairs, stride, control_rate_hz, is_sound=not wrong)
 
 
 def _motion_in(excerpts: Sequence[Excerpt], space: StateSpace) -> list[Float[np.ndarray, " _"]]:
     """Return the motion of each episode at each step: the sum over its numbers, each relative to its usual change."""
-    changes = [space.compute_differences(one.states) for one in excerpts]
+    changes = [space.compute_differences(excerpt.states) for excerpt in excerpts]
     for change in changes if space.rotation is not None else ():
         change[:, space.rotation] = Rotation.from_euler("xyz", change[:, space.rotation]).as_rotvec()
     scale = np.sqrt((np.concatenate(changes) ** 2).mean(axis=0))
@@ -145,9 +145,9 @@ def _motion_in(excerpts: Sequence[Excerpt], space: StateSpace) -> list[Float[np.
 
 def _noise_as_frames(excerpts: Sequence[Excerpt]) -> Iterator[Finding]:
     """Yield an error if consecutive frames differ as much as frames half an excerpt apart."""
-    excerpts = [one for one in excerpts if len(one.grey) >= _FEWEST_STEPS]
-    near, far = sum(float(one.frame_change.sum()) for one in excerpts), 0.0
-    for grey in (one.grey for one in excerpts):
+    excerpts = [excerpt for excerpt in excerpts if len(excerpt.grey) >= _FEWEST_STEPS]
+    near, far = sum(float(excerpt.frame_change.sum()) for excerpt in excerpts), 0.0
+    for grey in (excerpt.grey for excerpt in excerpts):
         half = len(grey) // 2
         far += float(np.abs(grey[half:] - grey[: len(grey) - half]).mean()) * (len(grey) - 1)
     if far > 0 and near >= _FAR_LIKE_NEAR * far:
@@ -157,19 +157,20 @@ def _noise_as_frames(excerpts: Sequence[Excerpt]) -> Iterator[Finding]:
 
 def _repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " _"]]) -> Iterator[Finding]:
     """Yield findings about repeated poses with changing frames, repeated frames with changing poses, and both."""
-    each_held = [(np.diff(one.states, axis=0) == 0).all(axis=1) for one in excerpts]
-    each_still = [is_still(one.frame_change) for one in excerpts]
-    singly = np.concatenate([_alone(one & other) for one, other in zip(each_held, each_still, strict=True)])
-    held, still = np.concatenate(each_held), np.concatenate(each_still)
-    fast = np.concatenate([one > np.median(one) for one in moved])
+    by_excerpt = [
+        ((np.diff(excerpt.states, axis=0) == 0).all(axis=1), is_still(excerpt.frame_change)) for excerpt in excerpts
+    ]
+    singly = np.concatenate([_alone(same_pose & same_frame) for same_pose, same_frame in by_excerpt])
+    same_pose, same_frame = (np.concatenate(masks) for masks in zip(*by_excerpt, strict=True))
+    fast = np.concatenate([motion > np.median(motion) for motion in moved])
     level: Level
-    if (stale := _share(held, ~still)) > _STALE:
+    if (stale := _share(same_pose, ~same_frame)) > _STALE:
         text = f"{100 * stale:.0f} % of the poses repeat the previous pose while the frame changes"
         level = "error" if stale > _MOSTLY_STALE else "warning"
         yield Finding(level, "stale poses", f"{text}: they are measured at a lower rate than the frames, or are stale")
-    if (shown_again := _share(still, fast & ~held)) > _COPIED:
-        text = f"{100 * shown_again:.0f} % of the frames repeat the previous frame while the robot moves"
-        level = "error" if shown_again > _MOSTLY_COPIED else "warning"
+    if (repeated := _share(same_frame, fast & ~same_pose)) > _COPIED:
+        text = f"{100 * repeated:.0f} % of the frames repeat the previous frame while the robot moves"
+        level = "error" if repeated > _MOSTLY_COPIED else "warning"
         yield Finding(level, "repeated", f"{text}: the camera has a lower rate. Check data.camera and the control rate")
     if (copied := float(singly.mean())) > _COPIED:
         text = f"{100 * copied:.0f} % of the steps are single repetitions of the previous step"
@@ -195,11 +196,11 @@ def _alone(mask: Bool[np.ndarray, " changes"]) -> Bool[np.ndarray, " changes"]:
 
 def _deltas_for_poses(excerpts: Sequence[Excerpt]) -> Iterator[Finding]:
     """Yield a finding if positions are too close to the robot's base, as differences of positions are."""
-    positions = [one.states[:, POSE.position] for one in excerpts]
+    positions = [excerpt.states[:, POSE.position] for excerpt in excerpts]
     median_m = float(np.median(np.linalg.norm(np.concatenate(positions), axis=1)))
     if not 0 < median_m < _INSIDE_M:
         return
-    steps = np.concatenate([np.diff(one, axis=0) for one in positions])
+    steps = np.concatenate([np.diff(position, axis=0) for position in positions])
     jumps = float(np.sqrt((steps**2).mean()) / np.sqrt((np.concatenate(positions) ** 2).mean()))
     text = f"half of the positions are within {median_m * 100:.1f} cm of the robot's base"
     if jumps > _DELTA_JUMPS:
@@ -231,21 +232,24 @@ def _agreement(
         is_sound: Whether no other fault was found that explains a low correlation.
     """
     pairs = [pair for pair in pairs if all(len(values) and np.ptp(values) > 0 for values in pair)]
-    usual = float(np.median([len(one) for one, _ in pairs])) if pairs else 0.0
-    pairs = [pair for pair in pairs if len(pair[0]) >= usual / 2]  # shorter ones would allow few shifts only
-    if len(pairs) < _FEWEST_EPISODES or usual < _FEWEST_STEPS:
+    median_steps = float(np.median([len(motion) for motion, _ in pairs])) if pairs else 0.0
+    pairs = [pair for pair in pairs if len(pair[0]) >= median_steps / 2]  # shorter ones would allow few shifts only
+    if len(pairs) < _FEWEST_EPISODES or median_steps < _FEWEST_STEPS:
         needed = f"needs at least {_FEWEST_EPISODES} moving episodes of {_FEWEST_STEPS} or more steps"
-        return Finding("skipped", "agreement", f"{needed}, found {len(pairs)} of {usual:.0f} steps (median)")
-    most = min(_MOST_LAG, int(usual) // _LAG_SHARE)
-    lags = range(-most, most + 1)  # control steps by which frames lag behind states
-    ways, seen = (_ranks([pair[which] for pair in pairs]) for which in (0, 1))
-    own, turned = _profiles(ways, seen, lags), _profiles(ways, _ranks([change[::-1] for _, change in pairs]), lags)
+        return Finding("skipped", "agreement", f"{needed}, found {len(pairs)} (median {median_steps:.0f} steps)")
+    max_lag = min(_MOST_LAG, int(median_steps) // _LAG_SHARE)
+    lags = range(-max_lag, max_lag + 1)  # control steps by which frames lag behind states
+    motions, frame_changes = (_ranks([pair[column] for pair in pairs]) for column in (0, 1))
+    matching = _profiles(motions, frame_changes, lags)
+    reversed_order = _profiles(motions, _ranks([change[::-1] for _, change in pairs]), lags)
     shifts = range(1, min(len(pairs), _SHIFTS + 1))
-    foreign = np.array([_profiles(ways, np.roll(seen, -shift, axis=0), lags).mean(axis=0).max() for shift in shifts])
-    mean, best, chance = own.mean(axis=0), int(own.mean(axis=0).argmax()), foreign.mean()
-    fitting, reverse = own[:, best], turned[:, int(turned.mean(axis=0).argmax())]
-    unshifted = own[:, lags.index(0)]
-    limit, lag = chance + _SURE * foreign.std(ddof=1), lags[best]
+    other_episodes = np.array(
+        [_profiles(motions, np.roll(frame_changes, -shift, axis=0), lags).mean(axis=0).max() for shift in shifts]
+    )
+    mean, best, chance = matching.mean(axis=0), int(matching.mean(axis=0).argmax()), other_episodes.mean()
+    fitting, reverse = matching[:, best], reversed_order[:, int(reversed_order.mean(axis=0).argmax())]
+    unshifted = matching[:, lags.index(0)]
+    limit, lag = chance + _SURE * other_episodes.std(ddof=1), lags[best]
     measure = f"rank correlation of frame change and motion over {counted(len(pairs), 'episode')}:"
     text = f"{measure} {mean[best]:.2f}, with another episode's frames {chance:.2f}"
     if reverse.mean() > limit and _surely_above(reverse, fitting):
@@ -264,7 +268,7 @@ def _agreement(
     if abs(lag) >= min(2, stride) and is_more and _surely_above(fitting, unshifted):
         text = f"{measure} {mean[best]:.2f} with shifted frames, {unshifted.mean():.2f} as recorded"
         fix = f"Give each frame the state of {steps} {'before' if lag > 0 else 'after'}"
-        by = f"frames are {'at least ' * (abs(lag) == most)}{shift} ({abs(lag) / control_rate_hz:.2f} s)"
+        by = f"frames are {'at least ' * (abs(lag) == max_lag)}{shift} ({abs(lag) / control_rate_hz:.2f} s)"
         level: Level = "error" if abs(lag) >= stride else "warning"  # an error: each action has the frames of another
         return Finding(level, "agreement", f"{by}; {text}. {fix}")
     backwards = int((reverse - fitting > _BACKWARDS).sum())
@@ -284,22 +288,22 @@ def _ranks(rows: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, "rows l
 
 
 def _profiles(
-    moved: Float[np.ndarray, "episodes longest"], seen: Float[np.ndarray, "episodes longest"], lags: range
+    motions: Float[np.ndarray, "episodes longest"], frame_changes: Float[np.ndarray, "episodes longest"], lags: range
 ) -> Float[np.ndarray, "episodes lags"]:
     """Return the correlation of motion and frame change in each row, with frames shifted by each lag."""
-    length = moved.shape[1]
+    length = motions.shape[1]
     columns = []
     for lag in lags:
-        one = moved[:, max(-lag, 0) : length - max(lag, 0)]
-        other = seen[:, max(lag, 0) : length - max(-lag, 0)]
-        ends = np.isnan(one + other)
-        first, second = (np.where(ends, np.nan, values) for values in (one, other))
+        motion = motions[:, max(-lag, 0) : length - max(lag, 0)]
+        change = frame_changes[:, max(lag, 0) : length - max(-lag, 0)]
+        ends = np.isnan(motion + change)
+        first, second = (np.where(ends, np.nan, values) for values in (motion, change))
         first, second = (values - np.nanmean(values, axis=1, keepdims=True) for values in (first, second))
         size = np.sqrt(np.nansum(first**2, axis=1) * np.nansum(second**2, axis=1))
         columns.append(np.nansum(first * second, axis=1) / np.where(size > 0, size, np.inf))
     return np.stack(columns, axis=1)
 
 
-def _surely_above(one: Float[np.ndarray, " episodes"], other: Float[np.ndarray, " episodes"]) -> bool:
-    difference = one - other
+def _surely_above(values: Float[np.ndarray, " episodes"], reference: Float[np.ndarray, " episodes"]) -> bool:
+    difference = values - reference
     return bool(difference.mean() > _SURE * difference.std(ddof=1) / np.sqrt(len(difference)))

@@ -57,7 +57,9 @@ def check_motion(dataset: Dataset) -> Iterator[Finding]:
         yield from _check_states(dataset, sample)
         yield from _check_rotation_format(dataset, sample)
     if dataset.config.is_cache:
-        yield Finding("skipped", "episode ends", "needs frames; check the data set that this cache was made from")
+        yield Finding(
+            "skipped", "episode ends", "needs frames, found a latent cache. Check the data set it was made from"
+        )
     else:
         yield _check_middles(dataset)
         yield _check_ends(dataset)
@@ -75,7 +77,7 @@ def warnings_from_index(dataset: Dataset) -> list[Finding]:
     if dataset.config.states == "pose":
         sample = list(read_sample(dataset, 0, also=_fast_episodes(dataset)))
         findings += scale_finding(dataset), *_check_states(dataset, sample)
-    return [one for one in findings if one.level == "warning"]
+    return [finding for finding in findings if finding.level == "warning"]
 
 
 def scale_finding(dataset: Dataset) -> Finding:
@@ -113,9 +115,9 @@ def _check_states(dataset: Dataset, sample: Sequence[ReadEpisode]) -> Iterator[F
     checked = f"{len(sample):,} of {counted(len(dataset.episodes), 'episode')} checked"
     by_index = f", {num_indexed:,} by the index" if num_indexed > len(sample) else ""
     stretches = [
-        Stretch(dataset.table.identity(one.index), start, one.states[start:end])
-        for one in sample
-        for start, end in one.selected
+        Stretch(dataset.table.identity(episode.index), start, episode.states[start:end])
+        for episode in sample
+        for start, end in episode.selected
         if end - start > 1
     ]
     yield speed_finding(stretches, dataset.control_rate_hz, checked + by_index)
@@ -132,15 +134,15 @@ def speed_finding(stretches: Sequence[Stretch], control_rate_hz: float, checked:
     """
     if not stretches:
         return Finding("skipped", "speed", "needs episodes of two or more steps, found none")
-    speeds, turns = control_rate_hz * np.concatenate([compute_step_sizes(one.states) for one in stretches]).T
+    speeds, turns = control_rate_hz * np.concatenate([compute_step_sizes(stretch.states) for stretch in stretches]).T
     excess = np.maximum(speeds / FASTEST_M_S, turns / FASTEST_RAD_S)
     if excess.max() <= 1:
         text = f"at most {speeds.max():.2f} m/s and {turns.max():.2f} rad/s between control steps ({checked})"
         return Finding("ok", "speed", text)
-    steps = [(one.name, one.start + step) for one in stretches for step in range(len(one.states) - 1)]
+    steps = [(stretch.name, stretch.start + step) for stretch in stretches for step in range(len(stretch.states) - 1)]
     fast, worst = np.flatnonzero(excess > 1).tolist(), int(excess.argmax())
     name, step = steps[worst]
-    episodes = counted(len({steps[one][0] for one in fast}), "episode")
+    episodes = counted(len({steps[index][0] for index in fast}), "episode")
     limit = f"{FASTEST_M_S:g} m/s or {FASTEST_RAD_S:g} rad/s, which no arm reaches"
     text = f"faster than {limit}: {counted(len(fast), 'control step')} in {episodes} ({checked})"
     example = f"{name}, step {step} to {step + 1}: {speeds[worst]:.1f} m/s, {turns[worst]:.1f} rad/s"
@@ -178,41 +180,43 @@ def _check_rotation_format(dataset: Dataset, sample: Sequence[ReadEpisode]) -> I
     """Yield the finding about rotations that are smoother if they are read in another format."""
     config, source, about = dataset.config, dataset.source, "rotation format"
     if config.is_cache:
-        yield Finding("skipped", about, "needs rotation numbers; check the data set that this cache was made from")
+        yield Finding(
+            "skipped", about, "needs recorded rotations, found a latent cache. Check the data set it was made from"
+        )
         return
     section, fields = config.pose_fields
     configured: RotationFormat = "euler_xyz" if fields is None else fields.rotation
     if num_rotation_numbers(configured) == 4:  # a quaternion has the same speed in both orders
         return
-    states = {one.index: one.states for one in sample}
+    states = {episode.index: episode.states for episode in sample}
     if configured != "euler_xyz" and isinstance(source, IndexedSource):
         raw = source.with_raw_states()
-        states = {index: np.asarray(one.states) for index, one in read_each(dataset, [*states], raw.read)}
+        states = {index: np.asarray(episode.states) for index, episode in read_each(dataset, [*states], raw.read)}
     numbers = [
-        one[start:end, POSE.rotation]
-        for index, one in states.items()
+        rows[start:end, POSE.rotation]
+        for index, rows in states.items()
         for start, end in dataset.selected_steps.ranges_of(index)
     ]
     speeds = measure_rotation_speeds(numbers, dataset.control_rate_hz)
     if smoother := find_smoother_format(speeds, configured, FASTEST_RAD_S):
         readings = "; ".join(
-            f"read as {name}, the hand turns by {one.median_rad_s:.2f} rad/s (median) and smoothly at"
-            f" {one.num_smooth_jumps} of {one.num_jumps} jumps of the numbers"
-            for name, one in speeds.items()
+            f"read as {name}, the median speed is {speed.median_rad_s:.2f} rad/s and the rotation is smooth at"
+            f" {speed.num_smooth_jumps} of {speed.num_jumps} jumps of the rotation numbers"
+            for name, speed in speeds.items()
             if name in {configured, smoother}
         )
         fix = f"Set data.{section}.rotation: {smoother}" if section else "Write extrinsic xyz Euler angles in radians"
         yield Finding("warning", about, f"{readings}. {fix}")
         return
-    of_configured, of_others = speeds[configured], [one for name, one in speeds.items() if name != configured]
-    decisive = min(map(of_configured.num_smoother_than, of_others), default=MIN_JUMPS)
+    as_configured, alternatives = speeds[configured], [speed for name, speed in speeds.items() if name != configured]
+    decisive = min(map(as_configured.num_smoother_than, alternatives), default=MIN_JUMPS)
     if decisive < MIN_JUMPS:
-        needed = f"needs at least {MIN_JUMPS} jumps of the rotation numbers, as where an angle passes pi"
-        yield Finding("skipped", about, f"{needed}, to tell formats apart; found {decisive}")
+        needed = f"needs at least {MIN_JUMPS} jumps of the rotation numbers (such as an angle that passes pi)"
+        yield Finding("skipped", about, f"{needed} to distinguish formats, found {decisive}")
     else:
-        smooth, jumps = of_configured.num_smooth_jumps, of_configured.num_jumps
-        text = f"the hand turns smoothly at {smooth} of {jumps} jumps of the rotation numbers"
-        yield Finding("ok", about, f"{text} if they are read as {configured}, and in no other format")
+        smooth, jumps = as_configured.num_smooth_jumps, as_configured.num_jumps
+        text = f"read as {configured}, the rotation is smooth at {smooth} of {jumps} jumps of the rotation numbers"
+        yield Finding("ok", about, f"{text}, and at fewer in every other format")
 
 
 def _check_ends(dataset: Dataset) -> Finding:
@@ -247,12 +251,12 @@ def _check_middles(dataset: Dataset) -> Finding:
     """Return the finding about episodes whose middle frame is blank, because a camera failed or images were lost."""
 
     def is_blank(index: int) -> bool:
-        start, end = max(dataset.selected_steps.ranges_of(index), key=lambda one: one[1] - one[0])
+        start, end = max(dataset.selected_steps.ranges_of(index), key=lambda limits: limits[1] - limits[0])
         return bool(np.ptp(small_grey(dataset.read(index).read_frames([(start + end) // 2]))) < BLANK)
 
-    seen = dict(read_each(dataset, sample_of(dataset, affordable(dataset, _MIDDLES)), is_blank))
-    blank = [dataset.table.identity(index) for index, is_one in seen.items() if is_one]
-    text = f"the middle frame is black or uniform in {len(blank)} of {counted(len(seen), 'episode')} checked"
+    results = dict(read_each(dataset, sample_of(dataset, affordable(dataset, _MIDDLES)), is_blank))
+    blank = [dataset.table.identity(index) for index, has_blank_frame in results.items() if has_blank_frame]
+    text = f"the middle frame is black or uniform in {len(blank)} of {counted(len(results), 'episode')} checked"
     return first_case("blank frames", text, (bool(blank), "warning", f"{format_identities(blank)}. {_EXCLUDE}"))
 
 

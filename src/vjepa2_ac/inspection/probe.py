@@ -38,7 +38,7 @@ from vjepa2_ac.intervals import MIN_EPISODES
 from vjepa2_ac.spaces import POSE, euler_from_matrices, matrices_from_euler
 
 SHIFTS = (1, 2, 4, 8)  # control steps
-AS_THEY_ARE = "as they are"
+UNCHANGED = "unchanged"
 _CANDIDATES_PER_CLIP = 8  # candidate starts per clip, because shifts need further states on both sides
 _GAIN = 0.01  # smaller gains, relative to persistence, are irrelevant
 
@@ -66,16 +66,16 @@ class VariantProbe:
     def verdict(self) -> str:
         """Return a sentence that states whether the unchanged data fit the model best."""
         plain, better = self.plain, self.better
-        text = f"one-step error / persistence {plain.ratio} on {counted(plain.clips, 'clip')}"
-        text += f" of {counted(plain.episodes, 'episode')}"
+        text = f"one-step error relative to persistence {plain.ratio} on {counted(plain.clips, 'clip')}"
+        text += f" from {counted(plain.episodes, 'episode')}"
         if better is not None and (difference := better.difference) is not None:
             less = f"{-difference.value:.3f} [{-difference.high:.3f}, {-difference.low:.3f}]"
-            return f"{text}, lower by {less} with {better.name}: {better.repair}"
+            return f"{text}; {less} lower for the variant '{better.name}'. To fix the data, {better.repair}"
         if plain.episodes < MIN_EPISODES:
             return f"needs at least {MIN_EPISODES} episodes, found {plain.episodes} ({text})"
         if plain.ratio.value >= 1:
             return f"needs a model that predicts these data better than persistence ({text})"
-        return f"{text}; no variant fits better with certainty"
+        return f"{text}; no variant is significantly better"
 
 
 def probe_config(
@@ -126,14 +126,14 @@ def probe_variants(
     frames = sample.frames_of(dataset.config)
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": frames}))
     windows, shifts = _with_room(dataset, candidates, sample.clips)
-    variants = [Variant(AS_THEY_ARE, lambda same: same), *variants_of(dataset.config, shifts)]
+    variants = [Variant(UNCHANGED, lambda same: same), *variants_of(dataset.config, shifts)]
     clips = SameClips(dataset, windows, sample.batch_size)
     plain, *measured = measure_variants(model, encode, clips, variants, progress)
     results = [
-        result_of(found, one.name, reference=plain, repair=one.repair)
-        for one, found in zip(variants[1:], measured, strict=True)
+        result_of(errors, variant.name, reference=plain, repair=variant.repair)
+        for variant, errors in zip(variants[1:], measured, strict=True)
     ]
-    return VariantProbe(result_of(plain, AS_THEY_ARE), tuple(results))
+    return VariantProbe(result_of(plain, UNCHANGED), tuple(results))
 
 
 def _with_room(
@@ -170,15 +170,15 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
     ]
     if config.actions == "difference":  # recorded commands cannot be reversed
         backwards = _of_states(lambda states: np.ascontiguousarray(states[::-1]))
-        variants.append(_variant("the states backwards", "reverse the order of the frames", backwards))
+        variants.append(_variant("states reversed", "reverse the order of the frames", backwards))
     if config.states == "pose":
         for axis, name in enumerate("xy"):
-            repair = f"negate {name}, with the rotation (as of a mirror)"
+            repair = f"negate {name} and mirror the rotation"
             variants.append(_variant(f"{name} negated", repair, _of_states(partial(mirrored, axis=axis))))
         inverted = _of_states(lambda states: np.append(states[:, :-1], 1 - states[:, -1:], axis=1))
         section, fields = config.pose_fields
         repair = f"exchange data.{section}.gripper_open and gripper_closed" if fields else "write 1 - gripper"
-        variants.append(_variant("the gripper inverted", repair, inverted))
+        variants.append(_variant("gripper inverted", repair, inverted))
     if not config.is_cache:
         exchanged, flipped = _of_frames(lambda frames: frames[..., ::-1]), _of_frames(lambda frames: frames[:, :, ::-1])
         repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"

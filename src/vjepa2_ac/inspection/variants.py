@@ -194,8 +194,8 @@ def load_named(config: Config, dataset: Dataset, model: str | None) -> WorldMode
         InputError: There is no such model, it cannot be read, it is random, or it does not fit the data.
     """
     if model is None and config.model.is_random:
-        found, needed = "a model that has learned nothing", "one that can say which stride it was trained at"
-        fix = "Set data.stride to a number, or name another model with model.base (data calibrate: --model)"
+        found, needed = "a random model", "a trained model, because its error determines the stride"
+        fix = "Set data.stride to a number, or set model.base to a trained model (data calibrate: --model)"
         raise InputError(where="model.base: random", found=found, needed=needed, fix=fix)
     if model is None:
         loaded = load_base(config.model, seed=config.seed)
@@ -235,17 +235,21 @@ class Calibration:
         """Return a sentence with the best stride and its certainty."""
         best, difference = self.best, self.best.difference
         seconds = self.stride / self.rate_hz
-        words = f"Best: stride {self.stride} ({seconds:.2f} s per model step), error/persistence {best.ratio}"
+        text = (
+            f"Best stride: {self.stride} ({seconds:.2f} s per model step), error relative to persistence {best.ratio}"
+        )
         if difference is None:
-            words += "; there is no other to compare with"
+            text += "; no other stride was measured"
         else:
-            words += f"; {-difference.value:.3f} below stride {_by_ratio(self.results)[1]}"
+            text += f"; {-difference.value:.3f} lower than at stride {_by_ratio(self.results)[1]}"
             if difference.has_interval:
-                words += f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})"
-            words += "" if self.is_certain else f": not certain on {counted(best.episodes, 'episode')}, try more"
+                text += f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})"
+            text += (
+                "" if self.is_certain else f", not significant with {counted(best.episodes, 'episode')}; measure more"
+            )
         if best.ratio.value >= 1:
-            return f"{words}. At no stride is the model better than persistence: does it fit this data at all?"
-        return f"{words}."
+            return f"{text}. The model is not better than persistence at any stride. Check that it fits these data."
+        return f"{text}."
 
     def as_dict(self) -> dict[str, Any]:
         """Return all metrics as plain values, for `calibration.json`."""
@@ -255,7 +259,7 @@ class Calibration:
             "verdict": self.verdict(),
             "split": self.split,
             "frames": self.frames,
-            "strides": [to_plain(asdict(one)) | {"stride": stride} for stride, one in self.results.items()],
+            "strides": [to_plain(asdict(result)) | {"stride": stride} for stride, result in self.results.items()],
             "impossible": {str(stride): why for stride, why in self.impossible.items()},
         }
 
@@ -396,6 +400,6 @@ def choose_stride(
     sample = ClipSample(clips=config.validation.clips, strides=tuple(fitting))
     calibration = calibrate_model(world_model, dataset, config, accelerator, sample)
     for result in calibration.results.values():
-        reporter.note(f"  {result.name}: error/persistence {result.ratio:.3f}")
+        reporter.note(f"  {result.name}: error relative to persistence {result.ratio:.3f}")
     reporter.note(calibration.verdict())
     return world_model, broadcast_object(accelerator, calibration)
