@@ -1,4 +1,4 @@
-"""The axes of an oracle that is turned by a known angle are found; a model without axes is said to have none."""
+"""Axis calibration recovers the known angle of a rotated oracle, and reports a problem for a model that ignores actions."""
 
 import functools
 from dataclasses import replace
@@ -43,7 +43,7 @@ def fitted_to_turned(degrees: float) -> AxisFit:
 
 
 @pytest.mark.parametrize("degrees", [0.0, -60.0, 179.9])
-def test_the_angle_of_a_turned_oracle_is_recovered_within_half_a_degree(degrees: float) -> None:
+def test_angle_of_a_rotated_oracle_is_recovered_within_half_a_degree(degrees: float) -> None:
     found = fitted_to_turned(degrees)
     yaw = found.yaw_degrees
     assert yaw.value == pytest.approx(degrees, abs=0.5)
@@ -53,11 +53,11 @@ def test_the_angle_of_a_turned_oracle_is_recovered_within_half_a_degree(degrees:
     assert (found.pairs, found.episodes) == (CLIPS, CLIPS // 2)
 
 
-def test_a_model_that_ignores_actions_is_refused() -> None:
+def test_axes_of_a_model_that_ignores_actions_are_a_problem() -> None:
     assert (fitted(Copier()).problem or "").startswith("no significant improvement")
 
 
-def test_a_turn_that_predicts_no_better_than_none_and_one_of_a_wide_interval_are_refused() -> None:
+def test_insignificant_or_uncertain_angle_is_a_problem() -> None:
     found = fitted_to_turned(-60.0)
     unsure = replace(found, error=Estimate(0.98, 0.95, 1.01))
     assert (unsure.problem or "").startswith("no significant improvement")
@@ -65,7 +65,7 @@ def test_a_turn_that_predicts_no_better_than_none_and_one_of_a_wide_interval_are
     assert (wide.problem or "").startswith("uncertain: yaw -60 degrees, 95 % interval -80 to -30")
 
 
-def test_mirrored_axes_and_one_episode_are_refused_by_name() -> None:
+def test_mirrored_axes_or_a_single_episode_are_a_problem() -> None:
     assert fitted(Turned(0.0, mirrored=True)).problem is not None
     batch = clips_batch(2)
     alone = infer_axes(Oracle(), [rollout_start(batch, clip, step) for clip in (0, 1) for step in range(TIME - 1)],
@@ -86,7 +86,7 @@ class Placed(Turned):
 
 
 @pytest.mark.parametrize("about", ["base", "middle"])
-def test_the_place_that_is_turned_about_is_found(about: str) -> None:
+def test_centre_of_the_rotation_is_recovered(about: str) -> None:
     """A mounting is turned about the base; a camera leaves what it looks at where it is."""
     there = torch.tensor([0.4, 0.1, 0.3, 0.0, 0.0, 0.0, 0.0])
     expected = there if about == "middle" else Axes(np.deg2rad(45.0)).rotate_poses(there)

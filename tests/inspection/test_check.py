@@ -44,7 +44,7 @@ def with_column(column: int, value: float) -> torch.Tensor:
     return states
 
 
-def test_good_numbers_are_all_well() -> None:
+def test_plausible_batch_has_only_ok_findings() -> None:
     assert {finding.level for finding in found_in().values()} == {"ok"}
 
 
@@ -65,18 +65,20 @@ def test_good_numbers_are_all_well() -> None:
         ("actions", "warning", "the steps are long", {"actions": good()["actions"] * 10}),
     ],
 )  # fmt: skip
-def test_wrong_numbers_are_named(about: str, level: str, words: str, changes: dict[str, torch.Tensor]) -> None:
+def test_implausible_batch_gives_the_finding_of_its_fault(
+    about: str, level: str, words: str, changes: dict[str, torch.Tensor]
+) -> None:
     finding = found_in(**changes)[about]
     assert (finding.level, words in finding.text) == (level, True), finding
 
 
-def knobs(droid: Path, **changes: object) -> DataConfig:
+def make_data_config(droid: Path, **changes: object) -> DataConfig:
     values = {"path": str(droid), "frames": 3, "stride": 2, "workers": 0, "validation_share": 0.3, "test_share": 0.0}
     return DataConfig.model_validate(values | changes)
 
 
-def test_a_whole_set_is_looked_at_as_training_would(droid: Path) -> None:
-    findings = list(check_data(knobs(droid), batch_size=2, clips=6))
+def test_check_of_a_data_set_reports_index_batch_and_timing(droid: Path) -> None:
+    findings = list(check_data(make_data_config(droid), batch_size=2, clips=6))
     about = {finding.about: finding for finding in findings}
     assert "6 episodes, 87 steps" in about["index"].text
     assert "frames (2, 3, 48, 65, 3) uint8" in about["batch"].text
@@ -84,23 +86,23 @@ def test_a_whole_set_is_looked_at_as_training_would(droid: Path) -> None:
     assert not [finding for finding in findings if finding.level == "error"]
 
 
-def test_an_empty_test_split_is_an_error_line_where_one_is_asked_for_as_training_refuses_it(droid: Path) -> None:
+def test_empty_test_split_is_an_error_only_if_its_share_is_above_zero(droid: Path) -> None:
     in_one_group = {"split_by": "(episode|.)"}
     for share, level in ((0.001, "error"), (0.0, "skipped")):
-        findings = check_data(knobs(droid, test_share=share, validation_share=0.0, **in_one_group), clips=2)
+        findings = check_data(make_data_config(droid, test_share=share, validation_share=0.0, **in_one_group), clips=2)
         assert {finding.about: finding.level for finding in findings}["test"] == level
 
 
-def test_a_test_split_that_cannot_answer_is_told_the_share_that_can(tmp_path: Path) -> None:
+def test_small_test_split_proposes_a_share_that_suffices(tmp_path: Path) -> None:
     few, many = (write_vectors(tmp_path / str(episodes), width=3, episodes=episodes) for episodes in (6, 45))
     values = {"source": "npz", "states": "vector", "validation_share": 0.1, "test_share": 0.15}
-    dataset = open_dataset(knobs(many, **values))
+    dataset = open_dataset(make_data_config(many, **values))
     tested = [dataset.table.identity(index) for index in np.flatnonzero(dataset.split_mask("test")).tolist()]
-    unlucky = knobs(
+    unlucky = make_data_config(
         many, **values, exclude=tuple(tested[3:])
     )  # a hash draws 3 of 38 episodes, where the share says 5.7
     texts = {}
-    for config in (knobs(few, **values), unlucky):
+    for config in (make_data_config(few, **values), unlucky):
         (texts[config.path],) = (one.text for one in check_data(config, clips=2) if "cannot show whether" in one.text)
     assert texts[str(few)].endswith("Record more episodes")
     proposed = float(re.search(r"data.test_share=([\d.]+)", texts[str(many)])[1])
@@ -110,9 +112,9 @@ def test_a_test_split_that_cannot_answer_is_told_the_share_that_can(tmp_path: Pa
     assert texts[str(many)].endswith(f"the split then has {members}")
 
 
-def test_behind_a_url_the_bytes_of_a_clip_are_told(gcs: Gcs, tmp_path: Path) -> None:
+def test_check_of_a_url_reports_the_bytes_fetched_per_clip(gcs: Gcs, tmp_path: Path) -> None:
     gcs.upload(write_vectors(tmp_path / "set", width=3), "bucket/set")
-    config = knobs("gs://bucket/set", source="npz", states="vector", validation_share=0.1, test_share=0.1)
+    config = make_data_config("gs://bucket/set", source="npz", states="vector", validation_share=0.1, test_share=0.1)
     config = config.model_copy(update={"disk_cache": DiskCacheConfig(dir=str(tmp_path / "cache"), limit_gb=0)})
     about = {finding.about: finding.text for finding in check_data(config, clips=2)}
     assert re.fullmatch(r"[\d,]+ kB fetched per clip \(mean of \d+ clips\)", about["network"])

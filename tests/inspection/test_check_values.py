@@ -29,7 +29,7 @@ def require(found: Values, pinned: Values) -> None:
         assert found[name][1] == pytest.approx(numbers, abs=0.011), name
 
 
-def test_values_of_a_moving_spot(tmp_path: Path) -> None:
+def test_values_of_a_moving_spot_equal_the_pinned_values(tmp_path: Path) -> None:
     episodes = [(states, spot_frames(states)) for states in map(spot_states, range(10))]
     folder = write_spots(tmp_path / "set", episodes)
     pinned: Values = {

@@ -35,7 +35,7 @@ def in_memory(hashes: list[int]) -> Dataset:
 
 
 @pytest.mark.parametrize("source", WRITERS)
-def test_copies_are_found_in_every_form_of_data_and_again_from_its_kept_index(source: str, tmp_path: Path) -> None:
+def test_copies_are_found_in_every_data_format_and_from_the_cached_index(source: str, tmp_path: Path) -> None:
     config = config_of(source, WRITERS[source](tmp_path / "set", RECORDINGS), tmp_path)
     for _ in range(2):
         dataset = open_dataset(config)
@@ -47,7 +47,7 @@ def test_copies_are_found_in_every_form_of_data_and_again_from_its_kept_index(so
         np.testing.assert_array_equal(*(dataset.source.read(place).states for place in (one, other)))  # type: ignore[arg-type]
 
 
-def test_a_far_set_of_which_nothing_tells_the_states_is_said_to_be_not_known(gcs: Gcs, tmp_path: Path) -> None:
+def test_duplicates_of_a_remote_data_set_without_states_are_skipped(gcs: Gcs, tmp_path: Path) -> None:
     gcs.upload(write_lerobot(tmp_path / "set", RECORDINGS), "bucket/set")
     config = config_of("lerobot", "gs://bucket/set", tmp_path)
     found = find_duplicates(open_dataset(config))
@@ -56,7 +56,7 @@ def test_a_far_set_of_which_nothing_tells_the_states_is_said_to_be_not_known(gcs
     assert str(found) == "needs the states of the episodes in the index, found none"
 
 
-def test_those_across_splits_are_counted_and_two_of_them_are_named() -> None:
+def test_copies_across_splits_are_counted_with_an_example() -> None:
     pairs = in_memory([1 + number // 2 for number in range(40)])
     found = find_duplicates(pairs)
     splits = {name: split for split in ("train", "validation", "test") for name in names_in(pairs, split)}
@@ -75,7 +75,7 @@ def names_in(dataset: Dataset, split: str) -> list[str]:
     return [dataset.table.identity(int(place)) for place in dataset.windows(split).episodes]  # type: ignore[arg-type]
 
 
-def test_no_copies_and_episodes_that_were_not_looked_at_are_none() -> None:
+def test_different_and_unhashed_episodes_are_no_duplicates() -> None:
     assert find_duplicates(in_memory([1, 2, 3, UNKNOWN, UNKNOWN])) == Duplicates(is_known=True)
 
 
@@ -97,7 +97,7 @@ def test_copies_with_noise_or_rounding_are_found_and_similar_episodes_are_not(tm
     assert (found.episodes, found.different, found.copies) == (9, 3, ("01", "02", "11", "12", "21", "22"))
 
 
-def test_check_and_inspect_warn_of_copies_and_are_calm_without(tmp_path: Path) -> None:
+def test_check_and_inspect_warn_only_if_there_are_copies(tmp_path: Path) -> None:
     copied = config_of("npz", write_npz(tmp_path / "copied", RECORDINGS), tmp_path)
     finding = next(one for one in check_data(copied, clips=2) if one.about == "duplicates")
     assert (finding.level, "5 episodes have the states" in finding.text) == ("warning", True)

@@ -78,7 +78,7 @@ def alarms_in(pairs: list[Pair], **about: object) -> list[Finding]:
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("space", [POSE, make_vector_states(7)], ids=["poses", "vectors"])
-def test_what_belongs_together_gives_no_alarm(seed: int, space: StateSpace) -> None:
+def test_matching_frames_and_states_have_only_ok_findings(seed: int, space: StateSpace) -> None:
     findings = found_in(recorded(seed), space=space)
     assert not [finding for finding in findings if finding.level != "ok"]
     assert findings[-1].text.startswith("frames change when the robot moves (rank correlation")
@@ -101,13 +101,13 @@ def test_what_belongs_together_gives_no_alarm(seed: int, space: StateSpace) -> N
         ("one frame", "error", "repeated", "100 % of the frames repeat the previous frame"),
     ],
 )
-def test_what_does_not_is_said_once_and_in_its_own_words(how: str, level: str, about: str, words: str) -> None:
+def test_each_fault_gives_exactly_one_finding_with_its_cause(how: str, level: str, about: str, words: str) -> None:
     (alarm,) = alarms_in(SPOILS[how](recorded()))
     assert (alarm.level, alarm.about, words in alarm.text) == (level, about, True), alarm
 
 
 @pytest.mark.parametrize("how", ["as it is", "foreign", "reversed"])
-def test_of_few_or_short_or_still_episodes_nothing_is_claimed(how: str) -> None:
+def test_agreement_of_few_short_or_still_episodes_is_skipped(how: str) -> None:
     for pairs in (recorded(episodes=5), recorded(steps=5), [(s[:1].repeat(STEPS, 0), f) for s, f in recorded()]):
         findings = found_in(SPOILS[how](pairs))
         assert [finding.level for finding in findings if finding.about == "agreement"] == ["skipped"]
@@ -124,7 +124,7 @@ def config_of(path: Path, tmp_path: Path, **changes: object) -> DataConfig:
     return DataConfig.model_validate(values | changes)
 
 
-def test_the_check_of_a_set_says_it_and_one_of_a_latent_cache_refers_to_the_set(tmp_path: Path) -> None:
+def test_check_reports_shifted_frames_and_skips_agreement_for_a_latent_cache(tmp_path: Path) -> None:
     late = config_of(write_spots(tmp_path / "late", SPOILS["late"](recorded())), tmp_path)
     findings = {finding.about: finding for finding in check_data(late, clips=2)}
     assert (findings["agreement"].level, "8 steps" in findings["agreement"].text) == ("error", True)
@@ -137,7 +137,7 @@ def in_memory(lengths: list[int], **changes: object) -> Dataset:
     return dataset_in_memory(MemorySource(lengths, unreadable=frozenset({3})), **changes)
 
 
-def test_the_middle_of_the_longest_kept_range_is_looked_at() -> None:
+def test_excerpt_is_the_middle_of_the_longest_selected_range() -> None:
     dataset = in_memory([300] * 4 + [20], exclude=())
     ranges = StepSelection(*(np.array(column, np.int32) for column in ([4, 4], [0, 8], [5, 20])))
     dataset = Dataset(dataset.config, dataset.source, dataset.table, ranges, dataset.broken)

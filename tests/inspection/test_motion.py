@@ -121,7 +121,7 @@ def test_clean_motion_has_no_warning_at_any_rate(tmp_path: Path, make: Callable[
     )
 
 
-def test_padding_is_named_with_its_steps_and_black_frames_are_counted(tmp_path: Path) -> None:
+def test_padding_finding_has_the_steps_and_black_frames_are_counted(tmp_path: Path) -> None:
     warnings = read_warnings(config_of(tmp_path / "set", padded))
     assert set(warnings) == {"speed", "padding", "episode ends"}
     assert warnings["padding"].startswith("45 states in 6 episodes with a position and a rotation of exactly zero")
@@ -157,7 +157,7 @@ def with_one_outlier(number: int) -> Pair:
 
 
 @pytest.mark.parametrize("in_sample", [200, 1])
-def test_one_impossible_position_in_one_episode_is_named(
+def test_single_impossible_position_in_one_episode_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_sample: int
 ) -> None:
     monkeypatch.setattr(motion, "_EPISODES", in_sample)
@@ -171,7 +171,7 @@ def test_one_impossible_position_in_one_episode_is_named(
     assert not warnings_from_index(open_dataset(config_of(tmp_path / "clean", clean)))
 
 
-def test_black_or_uniform_frames_of_some_episodes_are_named_and_no_frozen_camera(tmp_path: Path) -> None:
+def test_blank_frames_are_reported_with_episodes_and_not_as_a_frozen_camera(tmp_path: Path) -> None:
     def make(number: int) -> Pair:
         states, frames = clean(number)
         if number in (2, 4):
@@ -223,7 +223,7 @@ def test_frozen_camera_is_counted_where_the_robot_moves(tmp_path: Path) -> None:
     assert "the first 9 frames are one image while the robot moves" in warnings["episode ends"]
 
 
-def test_vectors_and_latent_caches_skip_what_needs_poses_and_frames(tmp_path: Path) -> None:
+def test_checks_that_need_poses_or_frames_are_skipped_for_vectors_and_latent_caches(tmp_path: Path) -> None:
     values = {"source": "npz", "path": str(write_vectors(tmp_path / "set", width=7)), "states": "vector"}
     config = DataConfig.model_validate(values | {"frames": 3, "stride": 2, "workers": 0})
     findings = findings_of(config)
@@ -254,7 +254,7 @@ FORMATS: dict[str, Callable[[Rotation], np.ndarray]] = {
 
 @pytest.mark.parametrize("true", ["euler_xyz", "rotation_vector"])
 @pytest.mark.parametrize("configured", FORMATS)
-def test_rotation_format_of_the_numbers_is_named(tmp_path: Path, true: str, configured: str) -> None:
+def test_wrong_rotation_format_is_a_warning_with_the_right_format(tmp_path: Path, true: str, configured: str) -> None:
     config = written_as(tmp_path / "set", FORMATS[true], configured)
     finding = findings_of(config)["rotation format"]
     assert finding.level == ("ok" if true == configured else "warning"), finding

@@ -133,7 +133,7 @@ FAULTS: dict[str, Fault] = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_each_fault_is_named_and_mending_it_makes_the_model_fit(name: str) -> None:
+def test_repairing_variant_of_each_fault_is_the_best_variant(name: str) -> None:
     probe = probed(dataset_of(FAULTS[name]))
     assert probe.better is not None
     assert probe.better.name == name
@@ -142,14 +142,14 @@ def test_each_fault_is_named_and_mending_it_makes_the_model_fit(name: str) -> No
 
 
 @pytest.mark.parametrize("name", ["red and blue exchanged", "frames mirrored"])
-def test_changed_frames_are_named(name: str) -> None:
+def test_variant_that_changes_frames_as_in_training_is_better(name: str) -> None:
     knowing = Knowing(sees_bgr=name.startswith("red"), sees_mirrored=name.startswith("frames"))
     probe = probed(dataset_of(at(0)), knowing)
     assert probe.better is not None
     assert probe.better.name == name
 
 
-def test_of_good_data_no_variant_fits_better_and_only_changed_frames_are_encoded_again() -> None:
+def test_correct_data_have_no_better_variant_and_only_changed_frames_are_encoded_again() -> None:
     knowing = Knowing()
     probe = probed(dataset_of(at(0)), knowing)
     assert probe.better is None
@@ -161,7 +161,7 @@ def test_of_good_data_no_variant_fits_better_and_only_changed_frames_are_encoded
     assert {one.name for one in probe.results} >= {*FAULTS, "red and blue exchanged"}
 
 
-def test_of_few_episodes_nothing_is_claimed() -> None:
+def test_probe_of_few_episodes_is_undecided() -> None:
     probe = probed(dataset_of(FAULTS["states reversed"], episodes=4))
     assert min(one.difference.value for one in probe.results) < -0.1
     assert probe.better is None
@@ -169,7 +169,7 @@ def test_of_few_episodes_nothing_is_claimed() -> None:
     assert not probe.is_decided
 
 
-def test_what_is_worse_than_persistence_is_no_better_reading() -> None:
+def test_variant_worse_than_persistence_is_not_better() -> None:
     def found(ratio: Estimate) -> VariantResult | None:
         difference = Estimate(-0.2, -0.25, -0.15)
         plain = VariantResult(UNCHANGED, Estimate(1.3, 1.2, 1.4), 0.4, 0.3, clips=64, episodes=12)
@@ -181,7 +181,7 @@ def test_what_is_worse_than_persistence_is_no_better_reading() -> None:
     assert found(Estimate(0.9, 0.85, 0.95)) is not None
 
 
-def test_a_model_that_predicts_nothing_gives_no_result() -> None:
+def test_probe_with_a_model_not_better_than_persistence_is_undecided() -> None:
     probe = probed(dataset_of(FAULTS["y negated"]), Copier())
     assert probe.better is None
     assert probe.verdict().startswith("needs a model that predicts these data better than persistence (")
@@ -189,7 +189,7 @@ def test_a_model_that_predicts_nothing_gives_no_result() -> None:
 
 
 @pytest.mark.parametrize(("steps", "widest"), [(STEPS, 8), (22, 4), (14, 2), (11, 1), (9, 0)])
-def test_shifts_are_measured_as_far_as_states_reach_on_both_sides(steps: int, widest: int) -> None:
+def test_shifts_are_limited_by_the_states_on_both_sides_of_a_clip(steps: int, widest: int) -> None:
     dataset = dataset_of(at(0), steps=steps)
     knowing = Knowing(steps)
     asked: list[tuple[int, int]] = []
@@ -209,7 +209,7 @@ def test_shifts_are_measured_as_far_as_states_reach_on_both_sides(steps: int, wi
     assert probe.better is None
 
 
-def test_vectors_are_shifted_and_turned_only_and_latents_keep_their_colours() -> None:
+def test_variants_depend_on_the_state_and_on_available_frames() -> None:
     def names(**changes: object) -> set[str]:
         return {one.name for one in variants_of(DataConfig.model_validate({"path": "set"} | changes), [1])}
 
@@ -222,7 +222,7 @@ def test_vectors_are_shifted_and_turned_only_and_latents_keep_their_colours() ->
     assert names(source="npz", states="vector", actions="recorded", join_actions="sum") == shifted | colours
 
 
-def test_of_changed_frames_persistence_is_another_one_too() -> None:
+def test_persistence_is_measured_on_the_changed_frames() -> None:
     """Or what moves less in latents would fit better."""
     knowing = Knowing()
 
@@ -240,7 +240,7 @@ def test_of_changed_frames_persistence_is_another_one_too() -> None:
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_mirror_of_a_mirror_is_the_world_and_hands_stay_right_hands(axis: int) -> None:
+def test_mirroring_twice_restores_poses_and_rotations_stay_proper(axis: int) -> None:
     generator = np.random.default_rng(axis)
     states = generator.uniform(-1, 1, (50, 7)) * [1, 1, 1, np.pi, 1.5, np.pi, 1]
     seen = mirrored(states, axis)

@@ -36,7 +36,7 @@ def names(probe: VariantProbe) -> set[str]:
     return {one.name for one in probe.results}
 
 
-def test_the_probe_prints_a_table_and_a_verdict_after_the_findings(
+def test_probe_prints_a_table_and_a_verdict_after_the_findings(
     make_config: MakeConfig, tmp_path: Path, capsys: Printed
 ) -> None:
     assert check(make_config(), tmp_path, "builtin:sim-tiny") == 0
@@ -51,7 +51,7 @@ def test_the_probe_prints_a_table_and_a_verdict_after_the_findings(
     assert re.fullmatch(r"0 errors, \d warnings?, [1-9] skipped", summary)
 
 
-def test_without_a_validation_split_training_episodes_are_probed(
+def test_probe_without_a_validation_split_uses_training_episodes(
     make_config: MakeConfig, tmp_path: Path, capsys: Printed
 ) -> None:
     config = make_config(data__validation_share=0.0, data__test_share=0.0)
@@ -63,7 +63,7 @@ def test_without_a_validation_split_training_episodes_are_probed(
     assert printed.splitlines()[-1].startswith("1 error, ")
 
 
-def test_a_latent_cache_is_probed_by_the_model_that_encoded_it_without_other_frames(
+def test_latent_cache_is_probed_with_its_encoder_and_without_frame_variants(
     make_config: MakeConfig, tmp_path: Path, capsys: Printed
 ) -> None:
     of_frames = make_config(data__frames=10, data__start_every=2)

@@ -45,13 +45,13 @@ def strip(colour: tuple[int, int, int] = (200, 30, 40), *, steps: int = 30, size
 
 
 @pytest.mark.parametrize(("rows", "steps", "size"), [(1, 1, (18, 32)), (12, 9, (64, 64)), (2, 40, (48, 20))])
-def test_any_number_of_rows_and_any_shape_of_image_fit(
+def test_sheet_has_the_same_width_for_any_number_of_rows_and_image_shape(
     plotted: Plotted, rows: int, steps: int, size: tuple[int, int]
 ) -> None:
     assert plotted(*(strip(steps=steps, size=size) for _ in range(rows))).shape[1] == 1430
 
 
-def test_the_crop_is_shown_unchanged_and_the_rest_is_pale(plotted: Plotted) -> None:
+def test_image_is_unchanged_inside_the_crop_and_pale_outside(plotted: Plotted) -> None:
     seen = plotted(strip())
     as_it_is = (abs(seen - (200, 30, 40)).max(axis=-1) <= 2).sum()
     pale = (abs(seen - (149, 98, 101)).max(axis=-1) <= 2).sum()

@@ -13,7 +13,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.statistics import MOVED, TURNED, idle_runs, inspect_dataset
 
 
-def knobs(droid: Path, **changes: object) -> DataConfig:
+def make_data_config(droid: Path, **changes: object) -> DataConfig:
     values = {"path": str(droid), "frames": 3, "stride": 2, "validation_share": 0.3, "test_share": 0.0}
     return DataConfig.model_validate(values | changes)
 
@@ -40,15 +40,15 @@ def test_motion_per_step_is_in_centimetres_and_degrees_at_every_stride(monkeypat
     assert too_wide == {"stride": 40, "seconds": 40 / 15, MOVED: [], TURNED: []}
 
 
-def test_standing_still_counts_from_a_run_that_is_long_enough() -> None:
+def test_only_long_enough_idle_runs_count_as_idle() -> None:
     states = straight_on(30)
     states[5:10] = states[5]  # steps 6 to 9 are idle: too short a run
     states[15:25] = states[15]
     assert np.flatnonzero(idle_runs(states, DataConfig(path="x"))).tolist() == list(range(16, 25))
 
 
-def test_figures_of_a_whole_set(droid: Path) -> None:
-    dataset = open_dataset(knobs(droid))
+def test_statistics_of_a_data_set_equal_values_computed_by_hand(droid: Path) -> None:
+    dataset = open_dataset(make_data_config(droid))
     found = inspect_dataset(dataset)
     values = found.values
     assert values["length_percentiles_0_10_50_90_100"] == [12, 12, 14, 16, 17]
@@ -73,7 +73,7 @@ def hundred(broken: frozenset[int], policy: str, pictureless: frozenset[int] = f
     )
 
 
-def test_an_episode_of_the_sample_that_cannot_be_read_is_counted_and_named(caplog: pytest.LogCaptureFixture) -> None:
+def test_unreadable_episode_of_the_sample_is_skipped_or_an_error_by_config(caplog: pytest.LogCaptureFixture) -> None:
     dataset = hundred(frozenset({7}), "skip")
     assert len(inspect_dataset(dataset).sample) == 99
     assert list(dataset.broken.reasons) == ["episode 7"]

@@ -30,9 +30,9 @@ def tracks(lengths: Sequence[int], noise: float = 0.0, unreadable: frozenset[int
     return MemorySource(lengths, states=states, names=names, unreadable=unreadable)
 
 
-def dataset_of(source: MemorySource, **knobs: object) -> Dataset:
+def dataset_of(source: MemorySource, **changes: object) -> Dataset:
     values = {"path": "tracks", "frames": 4, "stride": 1, "validation_share": 0.9, "test_share": 0.0, "workers": 0}
-    config = DataConfig.model_validate(values | knobs)
+    config = DataConfig.model_validate(values | changes)
     table = source.infos()
     kept = StepSelection.all_steps(table, np.ones(len(table), bool))
     return Dataset(config, source, table, kept, BrokenEpisodes(config, len(table)))
@@ -50,7 +50,7 @@ def encode(batch: Batch) -> LatentBatch:
     )
 
 
-class GoesOn:
+class ConstantVelocity:
     """Has learned that a robot is always `millimetres` farther in the next frame."""
 
     def __init__(self, millimetres: float) -> None:
@@ -65,21 +65,23 @@ class GoesOn:
         raise AssertionError("calibration needs no rollout")
 
 
-def calibrated(model: GoesOn, source: MemorySource, progress: Progress = no_progress, **options: object) -> Calibration:
+def calibrated(
+    model: ConstantVelocity, source: MemorySource, progress: Progress = no_progress, **options: object
+) -> Calibration:
     sample = ClipSample(batch_size=4, **options)  # type: ignore[arg-type]
     return calibrate(model, encode, dataset_of(source), sample, progress=progress)
 
 
 @pytest.mark.parametrize("learned", [4, 8, 15])
-def test_the_stride_that_a_model_has_learned_is_found(learned: int) -> None:
-    found = calibrated(GoesOn(learned), tracks([80] * 20, noise=0.1))
+def test_calibration_recovers_the_stride_of_the_training(learned: int) -> None:
+    found = calibrated(ConstantVelocity(learned), tracks([80] * 20, noise=0.1))
     assert found.stride == learned
     assert found.is_certain
     assert "not significant" not in found.verdict()
 
 
-def test_ratios_are_those_computed_by_hand() -> None:
-    found = calibrated(GoesOn(8), tracks([80] * 5), clips=10)
+def test_ratios_equal_values_computed_by_hand() -> None:
+    found = calibrated(ConstantVelocity(8), tracks([80] * 5), clips=10)
     assert list(found.results) == [4, 8, 15]
     assert [one.ratio.value for one in found.results.values()] == [
         pytest.approx(4 / 4, abs=1e-3), pytest.approx(0.0, abs=1e-3), pytest.approx(7 / 15, abs=1e-3),
@@ -89,7 +91,7 @@ def test_ratios_are_those_computed_by_hand() -> None:
     assert found.best.difference.value == pytest.approx(-7 / 15, abs=1e-3)
 
 
-def test_every_stride_is_measured_on_the_same_starts() -> None:
+def test_all_strides_are_measured_at_the_same_starts() -> None:
     seen: dict[int, list[tuple[str, int]]] = {}
 
     def noting(batch: Batch) -> LatentBatch:
@@ -98,55 +100,55 @@ def test_every_stride_is_measured_on_the_same_starts() -> None:
         return encode(batch)
 
     source = tracks([30, 50, 60, 80, 46])
-    calibrate(GoesOn(4), noting, dataset_of(source), ClipSample(batch_size=4, clips=12))
+    calibrate(ConstantVelocity(4), noting, dataset_of(source), ClipSample(batch_size=4, clips=12))
     assert seen[4] == seen[8] == seen[15]
     assert len(set(seen[4])) == 12
     assert "track 0" not in {episode for episode, _ in seen[4]}, "a clip at stride 15 has 46 steps"
 
 
-def test_a_model_that_does_nothing_is_certain_of_nothing() -> None:
-    found = calibrated(GoesOn(0), tracks([80] * 6, noise=0.2))
+def test_persistence_model_has_no_significant_best_stride() -> None:
+    found = calibrated(ConstantVelocity(0), tracks([80] * 6, noise=0.2))
     assert [one.ratio.value for one in found.results.values()] == [1.0, 1.0, 1.0]
     assert not found.is_certain
     assert "not significant" in found.verdict()
     assert "The model is not better than persistence at any stride" in found.verdict()
 
 
-def test_a_stride_that_fits_no_episode_is_named_and_the_others_are_measured() -> None:
-    found = calibrated(GoesOn(4), tracks([30] * 6))
+def test_stride_longer_than_every_episode_is_reported_and_the_others_are_measured() -> None:
+    found = calibrated(ConstantVelocity(4), tracks([30] * 6))
     assert list(found.results) == [4, 8]
     assert list(found.impossible) == [15]
     assert "46 steps for a clip of 4 frames at stride 15" in found.impossible[15]
 
 
-def test_one_long_episode_does_not_decide_for_all() -> None:
-    found = calibrated(GoesOn(4), tracks([30] * 6 + [80] * 1))
+def test_stride_that_fits_one_episode_only_is_impossible() -> None:
+    found = calibrated(ConstantVelocity(4), tracks([30] * 6 + [80] * 1))
     assert list(found.results) == [4, 8]
     assert "1 episode only" in found.impossible[15]
     assert found.best.episodes >= 5
 
 
-def test_clips_are_shortened_to_eight_frames_by_default() -> None:
+def test_clips_have_at_most_eight_frames_by_default() -> None:
     source = tracks([130] * 4)
-    assert calibrate(GoesOn(4), encode, dataset_of(source, frames=16), ClipSample()).frames == 8
-    assert calibrate(GoesOn(4), encode, dataset_of(source), ClipSample()).frames == 4
+    assert calibrate(ConstantVelocity(4), encode, dataset_of(source, frames=16), ClipSample()).frames == 8
+    assert calibrate(ConstantVelocity(4), encode, dataset_of(source), ClipSample()).frames == 4
 
 
-def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreadable_clips_are_skipped_and_an_error_if_no_clip_is_readable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vjepa2_ac.data.selection.max_broken", lambda episodes: episodes)
     monkeypatch.setattr(Dataset, "control_rate_hz", 15.0)
     source = tracks([80] * 20)
     dataset = dataset_of(source, broken_episodes="skip")
     source.unreadable = frozenset({int(dataset.windows("validation").episodes[0])})
-    found = calibrate(GoesOn(8), encode, dataset, ClipSample(clips=200, batch_size=1))
+    found = calibrate(ConstantVelocity(8), encode, dataset, ClipSample(clips=200, batch_size=1))
     assert found.best.episodes == len(dataset.windows("validation").episodes) - 1
     assert len({one.clips for one in found.results.values()}) == 1
     source.unreadable = frozenset(range(20))
     with pytest.raises(InputError, match="none of the clips can be read; broken episodes: track"):
-        calibrate(GoesOn(8), encode, dataset, ClipSample(batch_size=4))
+        calibrate(ConstantVelocity(8), encode, dataset, ClipSample(batch_size=4))
 
 
-def test_the_best_of_several_is_certain_only_by_twice_its_interval() -> None:
+def test_best_variant_needs_twice_the_half_width_of_its_interval() -> None:
     """Both were chosen on these clips: an interval that just leaves 0 out says little."""
     result = VariantResult("one", Estimate(0.5, 0.4, 0.6), 0.2, 0.4, clips=10, episodes=10)
     narrow, wide = (replace(result, difference=Estimate(-0.1, -0.1 - half, half - 0.1)) for half in (0.03, 0.08))

@@ -194,9 +194,9 @@ def load_named(config: Config, dataset: Dataset, model: str | None) -> WorldMode
         InputError: There is no such model, it cannot be read, it is random, or it does not fit the data.
     """
     if model is None and config.model.is_random:
-        found, needed = "a random model", "a trained model, because its error determines the stride"
+        needed = "a trained model, because its error determines the stride"
         fix = "Set data.stride to a number, or set model.base to a trained model (data calibrate: --model)"
-        raise InputError(where="model.base: random", found=found, needed=needed, fix=fix)
+        raise InputError(where="model.base: random", found="a random model", needed=needed, fix=fix)
     if model is None:
         loaded = load_base(config.model, seed=config.seed)
     else:
@@ -245,7 +245,9 @@ class Calibration:
             if difference.has_interval:
                 text += f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})"
             text += (
-                "" if self.is_certain else f", not significant with {counted(best.episodes, 'episode')}; measure more"
+                ""
+                if self.is_certain
+                else f", not significant with {counted(best.episodes, 'episode')}; measure more episodes"
             )
         if best.ratio.value >= 1:
             return f"{text}. The model is not better than persistence at any stride. Check that it fits these data."
@@ -306,9 +308,9 @@ def calibrate_model(
         InputError: As for `calibrate`, or the data are a latent cache.
     """
     if dataset.config.is_cache:
-        found = f"latents that were encoded for clips at stride {dataset.config.stride}"
+        cached = f"latents that were encoded for clips at stride {dataset.config.stride}"
         needed, fix = "frames at every candidate stride", "Calibrate on the data set itself, with data.cache: off"
-        raise InputError(where=f"data.path: {dataset.config.path}", found=found, needed=needed, fix=fix)
+        raise InputError(where=f"data.path: {dataset.config.path}", found=cached, needed=needed, fix=fix)
     sample = replace(sample, batch_size=config.validation.batch_size)
     encode = partial(encode_batch, world_model, device=accelerator.device)
     with accelerator.autocast(), torch.no_grad():
