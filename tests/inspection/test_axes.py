@@ -1,4 +1,4 @@
-"""Axis calibration recovers the known angle of a rotated oracle, and reports a problem for a model that ignores actions."""
+"""Axis calibration recovers the angle of a rotated oracle, and reports a problem if a model ignores actions."""
 
 import functools
 from dataclasses import replace

@@ -51,7 +51,7 @@ def encode(batch: Batch) -> LatentBatch:
 
 
 class ConstantVelocity:
-    """Has learned that a robot is always `millimetres` farther in the next frame."""
+    """Predicts that the robot moves by `millimetres` from each frame to the next."""
 
     def __init__(self, millimetres: float) -> None:
         self.millimetres = millimetres
