@@ -179,7 +179,7 @@ def test_a_missing_working_directory_is_reported(
     monkeypatch.chdir(folder)
     folder.rmdir()
     assert main(["config", "schema"]) == 2
-    assert "working directory: it is gone" in capsys.readouterr().err
+    assert "working directory: the folder does not exist" in capsys.readouterr().err
 
 
 def last_line(capsys: pytest.CaptureFixture[str]) -> str:

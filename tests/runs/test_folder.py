@@ -234,7 +234,7 @@ def test_remote_locations_of_a_run_are_printed_before_they_are_used(
     monkeypatch.setattr("vjepa2_ac.training.loop.train", contact)
     assert main(["train", str(run), "--resume"]) == 2
     for line in LINES:
-        assert f"{run} names a place elsewhere: {line}" in " ".join(said[0].split())
+        assert f"The config of {run} contains a URL: {line}" in " ".join(said[0].split())
 
 
 OLDER = {

@@ -34,48 +34,79 @@ def add_serve(commands: cli.Commands) -> None:
     """Add `serve` to a parser."""
     parser = cli.command(commands, "serve", _serve, "demo/run --goals goals --key-file key --host 0.0.0.0")
     cli.add_planner(parser, such_as="such as planning.limits.xyz=[0.01,0.01,0.01]")
-    cli.add(parser, "--goals FOLDER", "what a client may name: pictures, and folders that `goals` made", cli.as_path)
-    text = "delta: changes of each model step; pose: waypoints to the target pose, one a control step (delta)"
+    cli.add(
+        parser,
+        "--goals FOLDER",
+        "goals that a client can name: images, and folders from `vjepa2-ac goals`",
+        cli.as_path,
+    )
+    text = "delta: the change in each model step; pose: a waypoint for each control step (delta)"
     cli.add(parser, "--actions delta|pose", text, choices=["delta", "pose"], default="delta")
-    cli.add(parser, "--dry-run", "plan, and answer zeros: the robot stays where it is", action="store_true")
+    cli.add(parser, "--dry-run", "plan, but send zero actions", action="store_true")
     cli.add(parser, "--record FOLDER", "write each decision with its images to a new folder, up to 2 GB", cli.as_path)
     group = parser.add_argument_group("messages")
-    cli.add(group, "--image-key KEY", "the key of the camera's picture in requests (the usual ones)")
+    cli.add(group, "--image-key KEY", "key of the camera image in requests (the keys of openpi's examples)")
     seconds = cli.number_between(0, 3600, "seconds")
-    cli.add(group, "--deadline SECONDS", "after which the action of a decision is zero (60)", seconds, default=60.0)
+    cli.add(
+        group,
+        "--deadline SECONDS",
+        "time limit of a request; a late decision is a zero action (60)",
+        seconds,
+        default=60.0,
+    )
     group = parser.add_argument_group("access")
-    cli.add(group, "--host ADDRESS", "where it listens (127.0.0.1: this machine only)", default="127.0.0.1")
-    cli.add(group, "--port N", "0: a free one (8000)", cli.whole_number(0, 65535), default=8000)
-    cli.add(group, "--key-file FILE", "with the key that clients send; needed where others can reach it", cli.as_path)
-    cli.add(group, "--insecure", "no key, although others can reach the address", action="store_true")
-    cli.add(group, "--allow-host NAME", "a name that a proxy serves it under", action="append", default=[])
+    cli.add(group, "--host ADDRESS", "address to listen on (127.0.0.1: this machine only)", default="127.0.0.1")
+    cli.add(group, "--port N", "port; 0: any free port (8000)", cli.whole_number(0, 65535), default=8000)
+    cli.add(
+        group,
+        "--key-file FILE",
+        "file with the key that clients send; required if other machines can reach the server",
+        cli.as_path,
+    )
+    cli.add(group, "--insecure", "allow an address that other machines can reach without a key", action="store_true")
+    cli.add(group, "--allow-host NAME", "host name under which a proxy serves the server", action="append", default=[])
 
 
 def add_simulate(commands: cli.Commands) -> None:
     """Add `simulate` to a parser. `simulate record` records data; otherwise a model is tested in closed loop."""
     parser = cli.command(commands, "simulate", _simulate, "demo/run --task reach --domain B --episodes 10")
-    cli.add(parser, "subject RUN_OR_MODEL|record", "a run, or what model.base takes; or: record", cli.as_model)
-    cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
-    text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
+    cli.add(parser, "subject RUN_OR_MODEL|record", "a run, or a value of model.base; or the word record", cli.as_model)
+    cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: the output folder", nargs="*")
+    text = "the task (reach); record: push, pick or place with a block on the table (none: random reaching)"
     cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
-    cli.add(parser, "--domain", "random: record another world in each episode (A)", choices=["A", "B", "random"])
-    cli.add(parser, "--episodes N", "how many (50; record: 40)", cli.count)
+    cli.add(
+        parser,
+        "--domain",
+        "domain of the arm; random: a new random scene in each episode, only to record (A)",
+        choices=["A", "B", "random"],
+    )
+    cli.add(parser, "--episodes N", "number of problems (50); record: number of episodes (40)", cli.count)
     cli.add(parser, "--steps N", "model steps (8; pick 12, place 18); record: control steps (41; place 81)", cli.count)
-    cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
+    cli.add(parser, "--seed N", "random seed of the problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
     cli.add(parser, "--world COMMAND", "an environment: 'PYTHON examples/worlds/robosuite.py Lift' (docs/worlds.md)")
     seconds = cli.number_between(0, 86_400, "seconds")
-    cli.add(parser, "--world-timeout SECONDS", "for an answer of it, and five times for the first (120)", seconds)
+    cli.add(
+        parser,
+        "--world-timeout SECONDS",
+        "time limit for an answer of the environment; the first may take five times as long (120)",
+        seconds,
+    )
     group = parser.add_argument_group("to test a model")
     cli.add_all(group)
     cli.add_checkpoint(group, default=None)
     cli.add(group, "--config CONFIG", "for a model: the config whose `planning` is used", cli.as_local)
-    text = "goals on the way, of the oracle's solution: where gripper or arm stop, or each model step of it (none)"
+    text = "sub-goals from the oracle's solution: its key frames, or every model step (none)"
     cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
     cli.add(group, "--films N", "episodes in the video; 0: none (6)", cli.whole_number(0))
-    cli.add(group, "--out FOLDER", "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)", cli.as_path)
+    cli.add(group, "--out FOLDER", "output folder (closed_loop/TASK-DOMAIN in the run's folder)", cli.as_path)
     group = parser.add_argument_group("to record data")
-    cli.add(group, "--cameras N", "of 3 with an image of their own; others show the first (1)", cli.whole_number(1, 3))
-    cli.add(group, "--workers N", "processes; the data are the same whatever their number (1)", cli.count)
+    cli.add(
+        group,
+        "--cameras N",
+        "number of cameras that are rendered, 1 to 3; the others repeat the first (1)",
+        cli.whole_number(1, 3),
+    )
+    cli.add(group, "--workers N", "number of processes; the data do not depend on it (1)", cli.count)
 
 
 def _serve(options: argparse.Namespace) -> int:
@@ -96,7 +127,7 @@ def _serve(options: argparse.Namespace) -> int:
     from vjepa2_ac.serving.server import serve
 
     if options.record is not None:
-        cli.require_new_place(options.record)
+        cli.require_new_path(options.record)
     goals = None if options.goals is None else read_named_goals(options.goals)
     ended = serve(lambda: _loaded(options, goals), access, options.port, cli.show)
     if not ended:  # the planning thread still searches or loads; its result is not needed, so do not wait for it
@@ -161,15 +192,15 @@ def _simulate(options: argparse.Namespace) -> int:
 
 def _record(options: argparse.Namespace) -> int:
     if len(options.overrides) != 1:
-        found = " ".join(options.overrides) or "no folder"
-        raise InputError(where="simulate record", found=found, needed="one folder, where the data set goes")
+        problem = " ".join(options.overrides) or "no folder"
+        raise InputError(where="simulate record", found=problem, needed="one folder for the data set")
     try:
         target = cli.as_path(options.overrides[0])
     except argparse.ArgumentTypeError as error:
         raise InputError(where="simulate record", found=str(error), needed="a folder of this machine") from None
     if options.world is not None:
         return _record_world(options, target)
-    cli.require_new_place(target)
+    cli.require_new_path(target)
 
     from vjepa2_ac.simulation.record import RecordingSpec, default_steps, record_dataset
 

@@ -18,7 +18,7 @@ _CLIPS, _PAIRS = 64, 200  # for the calibration of strides and of axes; 200 pair
 
 def add_data(commands: cli.Commands) -> None:
     """Add `data` with its commands to a parser."""
-    text = "Look at a data set: can it be read, what is in it, does it fit?"
+    text = "Check, inspect, calibrate or convert a data set."
     parser = commands.add_parser("data", help=text, description=text)
     cli.add_commands(parser, {"commands": [_add_commands]})
 
@@ -35,17 +35,22 @@ def _add_commands(commands: cli.Commands) -> None:
 
     parser = cli.command(commands, "inspect", _inspect, "my_robot.yaml --out inspection")
     cli.add_config(parser, such_as=such_as)
-    cli.add(parser, "--out DIR", "where files go (inspection)", cli.as_path, default=out)
-    cli.add(parser, "--episodes --limit N", "episodes whose motion is looked at (100)", cli.count, default=100)
+    cli.add(parser, "--out DIR", "output folder (inspection)", cli.as_path, default=out)
+    cli.add(parser, "--episodes --limit N", "episodes whose motion is analysed (100)", cli.count, default=100)
     cli.add(parser, "--rows N", "episodes on the contact sheet (8)", cli.count, default=8)
 
     parser = cli.command(commands, "calibrate", _calibrate, "my_robot.yaml --limit 64")
     cli.add_config(parser, such_as=such_as)
-    cli.add(parser, "--axes RUN_OR_MODEL", "find the angle between its axes and the robot's: axes.json", cli.as_model)
-    cli.add(parser, "--model MODEL", "ask another than model.base: a .pt, a folder, or a run", cli.as_model)
+    cli.add(
+        parser,
+        "--axes RUN_OR_MODEL",
+        "measure the angle between this model's axes and the robot's axes; writes axes.json",
+        cli.as_model,
+    )
+    cli.add(parser, "--model MODEL", "the model to measure: a .pt, a folder, or a run (model.base)", cli.as_model)
     cli.add(parser, "--split", "of which (validation)", choices=["train", "validation", "test"], default="validation")
-    cli.add(parser, "--limit N", "clips at each stride (64), or pairs of frames (200)", cli.count)
-    cli.add(parser, "--out DIR", "where files go (inspection)", cli.as_path, default=out)
+    cli.add(parser, "--limit N", "clips for each stride (64); with --axes: pairs of frames (200)", cli.count)
+    cli.add(parser, "--out DIR", "output folder (inspection)", cli.as_path, default=out)
 
     parser = cli.command(commands, "convert", _convert, "my_robot.yaml data/as_lerobot")
     cli.add(parser, "config CONFIG", "a YAML config", cli.as_local)
@@ -64,7 +69,7 @@ def _convert(options: argparse.Namespace) -> None:
     is created when the conversion is complete.
     """
     config = cli.read_config(options.config, options.overrides)
-    cli.require_new_place(options.out)
+    cli.require_new_path(options.out)
 
     from vjepa2_ac.data.convert import convert_to_lerobot
 
@@ -196,7 +201,7 @@ def _calibrate(options: argparse.Namespace) -> int:
 def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
     """Fit the rotation between the model's axes and the robot's; return 1 if it cannot be used for planning."""
     if options.model is not None:
-        raise InputError(where="--model", found="--axes beside it", needed="one of them: --model is of strides")
+        raise InputError(where="--model", found="--axes and --model together", needed="one of the two options")
     cli.require_subject(options.axes)
 
     from vjepa2_ac.planning.settings import AXES_FILE, require_calibratable

@@ -24,24 +24,36 @@ if TYPE_CHECKING:
 def add_evaluate(commands: cli.Commands) -> None:
     """Add `evaluate` to a parser."""
     parser = cli.command(commands, "evaluate", _evaluate, "demo/run --clips 64 --decoder demo/decoder")
-    cli.add(parser, "subject RUN_OR_MODEL", "a run, or (with --data) what model.base takes", cli.as_model)
-    cli.add(parser, "overrides key=value", "model.base=PATH, if the base was moved", nargs="*")
-    cli.add(parser, "--against base|RUN|MODEL", "what to compare with (the base of a run)", cli.as_model, nargs="+")
+    cli.add(parser, "subject RUN_OR_MODEL", "a run, or (with --data) a value of model.base", cli.as_model)
+    cli.add(parser, "overrides key=value", "model.base=PATH, if the base model was moved", nargs="*")
+    cli.add(
+        parser,
+        "--against base|RUN|MODEL",
+        "the models to compare with (the base model of a run)",
+        cli.as_model,
+        nargs="+",
+    )
     cli.add(parser, "--clips N", "at most this many clips, spread over the episodes (256)", cli.count)
     cli.add_decoder(parser, "the rollouts as images, and measure these, too")
-    cli.add(parser, "--out FOLDER", "where figures go (the run's folder)", cli.as_path)
+    cli.add(parser, "--out FOLDER", "output folder (the run's folder)", cli.as_path)
     cli.add_all(parser)
     group = parser.add_argument_group("data, and what is measured")
-    cli.add(group, "--data CONFIG", "measure on its data (with its model.dtype, device, seed)", cli.as_local)
-    cli.add(group, "--split", "which held-out episodes (test)", choices=["test", "validation"])
+    cli.add(group, "--data CONFIG", "a config: use its data, model.dtype, device and seed", cli.as_local)
+    cli.add(group, "--split", "held-out episodes to measure (test)", choices=["test", "validation"])
     cli.add_checkpoint(group)
     group = parser.add_argument_group("use of the actions")
     cli.add(group, "--ranking-clips N", "clips for the action-ranking error (32)", cli.whole_number(0))
-    cli.add(group, "--samples N", "alternative actions for each of them (64)", cli.count)
-    cli.add(group, "--landscapes N", "with a landscape (8)", cli.whole_number(0), dest="landscape_clips")
+    cli.add(group, "--samples N", "alternative actions for each clip (64)", cli.count)
+    cli.add(group, "--landscapes N", "clips with an energy landscape (8)", cli.whole_number(0), dest="landscape_clips")
     cli.add(group, "--nodes N", "points of a landscape along each axis (9)", cli.whole_number(3, 51))
-    cli.add(group, "--reach CM", "half its width (7.5)", cli.number_between(0.0, 1000.0, "cm"), dest="reach_cm")
-    cli.add(group, "--examples N", "clips to show (4)", cli.whole_number(0))
+    cli.add(
+        group,
+        "--reach CM",
+        "half of the landscape's width (7.5)",
+        cli.number_between(0.0, 1000.0, "cm"),
+        dest="reach_cm",
+    )
+    cli.add(group, "--examples N", "example clips in the report (4)", cli.whole_number(0))
     cli.add(group, "--at-once N", "actions computed together (64): lower it to save memory", cli.count)
 
 
@@ -57,21 +69,23 @@ def add_imagine(commands: cli.Commands) -> None:
     """Add `imagine` to a parser."""
     parser = cli.command(commands, "imagine", _imagine, "demo/run --decoder demo/decoder --actions true,up,left")
     cli.add_planner(parser, such_as="such as model.base=PATH; with --image: planning.limits.xyz=data")
-    cli.add_decoder(parser, "what is imagined", required=True)
+    cli.add_decoder(parser, "the predicted frames", required=True)
     text = "true (as recorded), none, up, down, left, right, forward, back, open, close, with commas between them; or"
     text += " files, .npy or .csv, with a row of 7 numbers for each step (true,none,up,left,close)"
     cli.add(parser, "--actions NAMES", text, _names)
-    cli.add(parser, "--steps N", "model steps to imagine (7)", cli.count, default=7)
-    cli.add(parser, "--size CM", "of a named action in each step, within planning.limits (5)", float, default=5.0)
-    cli.add(parser, "--out FOLDER", "where the film goes (imagined, in the run's)", cli.as_path)
+    cli.add(parser, "--steps N", "number of model steps (7)", cli.count, default=7)
+    cli.add(
+        parser, "--size CM", "length of a named action in each step, within planning.limits (5)", float, default=5.0
+    )
+    cli.add(parser, "--out FOLDER", "output folder (imagined in the run's folder)", cli.as_path)
     group = parser.add_argument_group("the clip")
-    cli.add(group, "--episode ID", "its episode's name in the data, or a part of it (the one with the most motion)")
-    cli.add(group, "--start N", "its first control step (0)", cli.whole_number(0))
-    cli.add(group, "--split", "which episodes (test)", choices=["test", "validation", "train"], default="test")
-    cli.add(group, "--data CONFIG", "clips of other data; needed for a model", cli.as_local)
+    cli.add(group, "--episode ID", "name of the episode, or a part of it (the episode with the most motion)")
+    cli.add(group, "--start N", "first control step of the clip (0)", cli.whole_number(0))
+    cli.add(group, "--split", "episodes to use (test)", choices=["test", "validation", "train"], default="test")
+    cli.add(group, "--data CONFIG", "a config: use its data; required for a model", cli.as_local)
     group = parser.add_argument_group("instead of a clip")
-    cli.add(group, "--image IMAGE", "what a camera sees: PNG or JPEG; actions by name only", cli.as_local)
-    cli.add(group, "--state NUMBERS", "measured then, as `plan --state`", cli.as_numbers)
+    cli.add(group, "--image IMAGE", "a camera image: PNG or JPEG; then actions are names only", cli.as_local)
+    cli.add(group, "--state NUMBERS", "the measured state, as for `plan --state`", cli.as_numbers)
 
 
 def _evaluate(options: argparse.Namespace) -> None:
@@ -88,7 +102,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         raise InputError(where="command line", found=" ".join(unused), needed=needed, fix=fix)
     request = cli.evaluation_options(options, probes=cli.record_of_options(ProbeOptions, options))
     cli.require_subject(subject, resolve_config(subject, request), options.words)
-    cli.say_places_elsewhere(subject)
+    cli.report_relocated_paths(subject)
 
     from vjepa2_ac.cli.tables import row_tables
     from vjepa2_ac.distributed import leave_processes
@@ -210,7 +224,7 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Roll
     from vjepa2_ac.evaluation.request import resolve_config
     from vjepa2_ac.simulation.counterfactual import simulated_outcome
 
-    cli.say_places_elsewhere(options.subject)
+    cli.report_relocated_paths(options.subject)
     how = {"evaluation": cli.evaluation_options(options, out=out), "size_m": options.size / 100}
     request = cli.record_of_options(ImagineOptions, options, **how)
     cli.require_subject(options.subject, resolve_config(options.subject, request.evaluation), options.words)

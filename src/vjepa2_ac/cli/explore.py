@@ -31,15 +31,30 @@ _EPISODES = 8  # number of episodes to simulate for the package's model, which h
 def add_explore(commands: cli.Commands) -> None:
     """Add `explore` to a parser."""
     parser = cli.command(commands, "explore", _explore, "demo/run --against base")
-    text = f"a run, or what model.base takes ({_DEMO_RUN} if it is there, else {_BUILTIN_MODEL})"
+    text = f"a run, or a value of model.base ({_DEMO_RUN} if it exists, otherwise {_BUILTIN_MODEL})"
     cli.add(parser, "subject RUN_OR_MODEL", text, cli.as_model, nargs="?")
-    cli.add(parser, "overrides key=value", "such as planning.samples=200 (on a CPU a quick search)", nargs="*")
-    cli.add(parser, "--against base|RUN|MODEL", "repeatable (the base of a run)", cli.as_model, action="append")
-    cli.add(parser, "--decoder FOLDER", "of `vjepa2-ac decoder` (beside the run, else builtin:sim-tiny)", cli.as_model)
-    cli.add(parser, "--data CONFIG", "explore its data; needed for a model but the package's own", cli.as_local)
-    cli.add(parser, "--split", "which episodes (test)", choices=["test", "validation", "train"], default="test")
+    cli.add(
+        parser, "overrides key=value", "such as planning.samples=200 (on a CPU the default search is short)", nargs="*"
+    )
+    cli.add(
+        parser,
+        "--against base|RUN|MODEL",
+        "a model to compare with; repeatable (the base model of a run)",
+        cli.as_model,
+        action="append",
+    )
+    cli.add(
+        parser,
+        "--decoder FOLDER",
+        "a decoder from `vjepa2-ac decoder` (the one next to the run, otherwise builtin:sim-tiny)",
+        cli.as_model,
+    )
+    cli.add(
+        parser, "--data CONFIG", "a config: show its data; required for a model, except builtin:sim-tiny", cli.as_local
+    )
+    cli.add(parser, "--split", "episodes to use (test)", choices=["test", "validation", "train"], default="test")
     cli.add_checkpoint(parser)
-    cli.add(parser, "--port N", "of the page; 0: a free one (8001)", cli.whole_number(0, 65535), default=8001)
+    cli.add(parser, "--port N", "port of the page; 0: any free port (8001)", cli.whole_number(0, 65535), default=8001)
 
 
 def _explore(options: argparse.Namespace) -> int:
@@ -53,7 +68,7 @@ def _explore(options: argparse.Namespace) -> int:
     subject = options.subject or (_DEMO_RUN if is_run(_DEMO_RUN) else _BUILTIN_MODEL)
     config = read_run_config(Path(subject), options.overrides) if is_run(subject) else None
     cli.require_subject(subject, config, options.words)
-    cli.say_places_elsewhere(subject)
+    cli.report_relocated_paths(subject)
     decoder = _decoder(subject, options)
     with _data(subject, options) as data:
         with cli.reporter() as reporter:

@@ -165,27 +165,38 @@ def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a 
 
 def add_checkpoint(parser: argparse._ActionsContainer, default: str | None = "selected") -> None:
     """Add the option that selects a checkpoint of a run."""
-    add(parser, "--checkpoint STEP", "or best, newest, selected (the best, else the newest)", default=default)
+    add(
+        parser,
+        "--checkpoint STEP",
+        "a step, or best, newest, selected (the best, otherwise the newest)",
+        default=default,
+    )
 
 
 def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
     """Add the arguments of `load_planning_session`: run or model, overrides, checkpoint, config and extrinsics."""
-    add(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
+    add(parser, "subject RUN_OR_MODEL", "folder of a run, or a value of model.base", as_model)
     add(parser, "overrides key=value", such_as, nargs="*")
     group = parser.add_argument_group("the model")
     add_checkpoint(group)
-    add(group, "--config CONFIG", "for a model: the config whose planning, crop and dtype count", as_local)
+    add(group, "--config CONFIG", "for a model: the config with planning, crop and dtype", as_local)
     add(group, "--extrinsics NUMBERS", "the camera's pose x,y,z,roll,pitch,yaw, if the model uses it", _camera_pose)
 
 
 def add_all(parser: argparse._ActionsContainer) -> None:
     """Add the option that prints all tables in addition to the summary."""
-    add(parser, "--all", "print every table, too, and the files that were written", action="store_true")
+    add(parser, "--all", "also print every table and the names of the written files", action="store_true")
 
 
 def add_decoder(parser: argparse._ActionsContainer, shows: str, **how: Any) -> None:
     """Add `--decoder`, the decoder that converts latents into images."""
-    add(parser, "--decoder FOLDER", f"show {shows}: of `vjepa2-ac decoder`, or builtin:sim-tiny", as_model, **how)
+    add(
+        parser,
+        "--decoder FOLDER",
+        f"show {shows} with a decoder from `vjepa2-ac decoder`, or builtin:sim-tiny",
+        as_model,
+        **how,
+    )
 
 
 def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace, **more: Any) -> _Record:
@@ -222,11 +233,11 @@ def reporter() -> ConsoleReporter:
     return ConsoleReporter()
 
 
-def say_places_elsewhere(subject: str) -> None:
+def report_relocated_paths(subject: str) -> None:
     """Print the remote URLs in the config of a run, before any of them is contacted; print nothing for a model."""
     if is_run(subject) and is_first_process():
         for url in list_remote_locations(read_run_config(Path(subject))):
-            show(f"{subject} names a place elsewhere: {url}")
+            show(f"The config of {subject} contains a URL: {url}")
 
 
 def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool = False, of_run: bool = False) -> Config:
@@ -248,9 +259,9 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
     config = load_config_of_run(Path(path), overrides) if of_run else load_config(path, overrides)
     data = config.data.path
     if not paths.is_url(data) and not Path(data).exists():
-        found = f"no such file or folder, seen from {Path.cwd()}"
+        problem = f"no such file or folder, working directory {Path.cwd()}"
         fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
-        raise InputError(where=f"data.path: {data}", found=found, needed="a data set", fix=fix)
+        raise InputError(where=f"data.path: {data}", found=problem, needed="a data set", fix=fix)
     if base:
         require_model(config.model)
     return config
@@ -292,7 +303,7 @@ def load_planning_session(options: argparse.Namespace) -> Subject:
     """Load the run or model that plans, with the options that `require_to_plan` has checked."""
     from vjepa2_ac.planning.model_setup import load_for_planning
 
-    say_places_elsewhere(options.subject)
+    report_relocated_paths(options.subject)
     how = {"checkpoint": options.checkpoint or "selected", "config": options.config, "overrides": options.overrides}
     return load_for_planning(options.subject, **how)
 
@@ -320,7 +331,7 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
 
-def require_new_place(folder: Path) -> None:
+def require_new_path(folder: Path) -> None:
     """Check that an output folder is new or empty and can be written, before any long computation.
 
     Raises:

@@ -26,20 +26,34 @@ _COLUMNS = 100
 def add_plan(commands: cli.Commands) -> None:
     """Add `plan` to a parser."""
     parser = cli.command(commands, "plan", _plan, "demo/run --start a.png --goal b.png --state 0.4,0,0.3,3,0,0,0")
-    cli.add_planner(parser, such_as=f"such as planning.horizon=2; quick, for a CPU: {_QUICK}")
-    cli.add(parser, "--start IMAGE", "what the camera sees now: PNG or JPEG", cli.as_local, required=True)
+    cli.add_planner(parser, such_as=f"such as planning.horizon=2; for a CPU: {_QUICK}")
+    cli.add(parser, "--start IMAGE", "the current camera image: PNG or JPEG", cli.as_local, required=True)
     text = "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or a vector"
     cli.add(parser, "--state NUMBERS", text, cli.as_numbers, required=True)
     goals = parser.add_mutually_exclusive_group(required=True)
-    cli.add(goals, "--goal IMAGE", "what it is to see; again for goals in a row", cli.as_local, action="append")
-    cli.add(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", cli.as_path)
-    cli.add(goals, "--goal-from EPISODE", "what the run's data show at its end; EPISODE:STEP: there")
-    cli.add(parser, "--out FOLDER", "where both files go (plan)", cli.as_path, default=Path("plan"))
-    cli.add(parser, "--mask IMAGE", "black where the goal image does not count, of its size", cli.as_local)
+    cli.add(
+        goals,
+        "--goal IMAGE",
+        "the goal image; repeat the option for several goals in order",
+        cli.as_local,
+        action="append",
+    )
+    cli.add(goals, "--goals FOLDER", "a folder of goals, written by `vjepa2-ac goals`", cli.as_path)
+    cli.add(
+        goals, "--goal-from EPISODE", "the last frame of an episode of the run's data; EPISODE:STEP: this control step"
+    )
+    cli.add(parser, "--out FOLDER", "output folder (plan)", cli.as_path, default=Path("plan"))
+    cli.add(parser, "--mask IMAGE", "mask of the goal image, of the same size: black pixels are ignored", cli.as_local)
     group = parser.add_argument_group("the search, and its image")
-    cli.add(group, "--seed N", "of the search (the config's)", cli.whole_number(0, 2**31 - 1))
-    cli.add(group, "--nodes N", "of the energy maps along each axis; 0: none (9)", cli.whole_number(0, 101), default=9)
-    cli.add_decoder(group, "in the image what the planner imagined, beside the goal")
+    cli.add(group, "--seed N", "random seed of the search (the config's)", cli.whole_number(0, 2**31 - 1))
+    cli.add(
+        group,
+        "--nodes N",
+        "points of the energy maps along each axis; 0: no maps (9)",
+        cli.whole_number(0, 101),
+        default=9,
+    )
+    cli.add_decoder(group, "the predicted frames in the image, next to the goal")
 
 
 def add_goals(commands: cli.Commands) -> None:
@@ -47,15 +61,21 @@ def add_goals(commands: cli.Commands) -> None:
     parser = cli.command(commands, "goals", _goals, "my_robot.yaml --episode 3 --out goals/cup")
     cli.add(parser, "source CONFIG", "the config of the data with the episode", cli.as_local)
     cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
-    cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
-    cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)", default="0")
-    cli.add(parser, "--every N", "control steps, instead of where the gripper changes or the arm stops", cli.count)
-    group = parser.add_argument_group("where goals lie, and when the next one follows")
-    cli.add(group, "--apart N", "least frames from a stop of the arm to another goal (4)", cli.count, default=4)
-    cli.add(group, "--slack N", "model steps that a goal may take fewer or more (3)", cli.whole_number(0), default=3)
-    share, energy = cli.number_between(0.0, 1.0, "the energy"), "below this share of the energy at a goal's beginning"
-    cli.add(group, "--share X", f"{energy} the next one follows (none: by steps only)", share)
-    cli.add(group, "--stop-share X", f"{energy} the last one is reached (none: an equal image)", share)
+    cli.add(parser, "--out FOLDER", "output folder, new or empty", cli.as_path, required=True)
+    cli.add(parser, "--episode ID|NUMBER", "name of the episode, or its number from 0 on (0)", default="0")
+    cli.add(parser, "--every N", "use every N-th control step, instead of key frames", cli.count)
+    group = parser.add_argument_group("selection of the goals, and when the next goal applies")
+    cli.add(
+        group,
+        "--apart N",
+        "minimum number of frames between a stop of the arm and another goal (4)",
+        cli.count,
+        default=4,
+    )
+    cli.add(group, "--slack N", "tolerance of a goal's duration in model steps (3)", cli.whole_number(0), default=3)
+    share, energy = cli.number_between(0.0, 1.0, "the energy"), "below this fraction of the energy at a goal's start"
+    cli.add(group, "--share X", f"{energy} the next goal applies (none: after its steps)", share)
+    cli.add(group, "--stop-share X", f"{energy} the last goal is reached (none: an equal image)", share)
 
 
 def _plan(options: argparse.Namespace) -> int:
@@ -156,7 +176,7 @@ def _goals(options: argparse.Namespace) -> None:
     """
     from vjepa2_ac.data.windows import require_stride
 
-    cli.require_new_place(options.out)
+    cli.require_new_path(options.out)
     config = cli.read_config(options.source, options.overrides)
     stride = require_stride(config.data, to="make goals", fix="Say how many control steps it has: data.stride=4")
 

@@ -17,34 +17,47 @@ def add_score(commands: cli.Commands) -> None:
     """Add `score` to a parser."""
     parser = cli.command(commands, "score", _score, "demo/run --policy mine.npz --policy other.npz")
     cli.add_planner(parser, such_as="such as planning.energy.distance=l2")
-    text = "what a policy would do at frames of the data's episodes: .npz; again for others"
+    text = "actions of a policy at recorded frames (.npz); repeat the option for several policies"
     cli.add(parser, "--policy FILE", text, cli.as_path, action="append", dest="policies", required=True)
-    text = "numbers are poses to reach, changes from pose to pose, or of all poses from the present one (targets)"
+    text = "rows are poses to reach, changes from pose to pose, or changes from the first pose (targets)"
     cli.add(parser, "--form FORM", text, choices=_FORMS, default="targets")
-    cli.add(parser, "--control-steps N", "of a chunk, in a model step (data.stride)", cli.count)
-    cli.add(parser, "--out FILE", "where the scores go, as JSON (score.json)", cli.as_path, default=Path("score.json"))
+    cli.add(parser, "--control-steps N", "control steps of a chunk in one model step (data.stride)", cli.count)
+    cli.add(parser, "--out FILE", "output file (score.json)", cli.as_path, default=Path("score.json"))
 
 
 def add_prior(commands: cli.Commands) -> None:
     """Add `prior` to a parser."""
     parser = cli.command(commands, "prior", _prior, "demo/run")
-    cli.add(parser, "subject RUN|CONFIG", "folder of a run, or a config, of whose data and encoder it is", cli.as_local)
+    cli.add(parser, "subject RUN|CONFIG", "a run or a config, whose data and encoder are used", cli.as_local)
     cli.add(parser, "overrides key=value", "of the config, such as training.device=cpu", nargs="*")
-    cli.add(parser, "--out FOLDER", "where it goes (prior, in the run's folder)", cli.as_path)
+    cli.add(parser, "--out FOLDER", "output folder (prior in the run's folder)", cli.as_path)
     cli.add(parser, "--steps N", "optimizer steps (2000)", cli.count)
-    cli.add(parser, "--ahead N", "most model steps from a frame to its goal (those of a clip)", cli.count)
+    cli.add(
+        parser, "--ahead N", "maximum number of model steps from a frame to its goal (the length of a clip)", cli.count
+    )
 
 
 def add_monitor(commands: cli.Commands) -> None:
     """Add `monitor` to a parser."""
     parser = cli.command(commands, "monitor", _monitor, "demo/run --episode 3")
     cli.add_planner(parser, such_as="such as model.dtype=bfloat16")
-    cli.add(parser, "--data CONFIG", "watch episodes of its data (those of the run)", cli.as_local)
-    cli.add(parser, "--episode ID|NUMBER", "watch this one of the data; repeatable", action="append", default=[])
+    cli.add(parser, "--data CONFIG", "a config: use episodes of its data (the run's data)", cli.as_local)
+    cli.add(parser, "--episode ID|NUMBER", "an episode to check; repeatable", action="append", default=[])
     share = cli.number_between(0.0, 1.0, "a share")
-    cli.add(parser, "--false-alarms SHARE", "of undisturbed episodes, at most (0.05)", share, default=0.05)
-    cli.add(parser, "--threshold FILE", "a monitor.json (made of the held-out episodes of the data)", cli.as_local)
-    cli.add(parser, "--out FOLDER", "where monitor.json goes (the run's)", cli.as_path)
+    cli.add(
+        parser,
+        "--false-alarms SHARE",
+        "maximum fraction of undisturbed episodes with an alarm (0.05)",
+        share,
+        default=0.05,
+    )
+    cli.add(
+        parser,
+        "--threshold FILE",
+        "a monitor.json with the threshold (computed from the held-out episodes)",
+        cli.as_local,
+    )
+    cli.add(parser, "--out FOLDER", "output folder (the run's folder)", cli.as_path)
 
 
 def _score(options: argparse.Namespace) -> int:
@@ -87,16 +100,16 @@ def _monitor(options: argparse.Namespace) -> int:
     """Detect frames that deviate from the model's predictions.
 
     Each frame of an episode is predicted from the previous one. The threshold is calibrated on held-out episodes
-    without disturbances. With `planning.monitor=FILE`, `serve` reports alarms. The exit status is 1 if a watched
-    episode has an alarm.
+    without disturbances. With `planning.monitor=FILE`, `serve` reports alarms.
+    The exit status is 1 if a checked episode has an alarm.
     """
     if (views := cli.require_to_plan(options).planning.views) > 1:
         needed, fix = "1: a monitor is made with one camera", "Add planning.views=1"
         raise InputError(where="planning.views", found=f"{views}", needed=needed, fix=fix)
     if options.out is None and not is_run(options.subject):
-        found, needed = "a model, which has no folder for the monitor", "the folder of a run; or a model with --out"
+        problem, needed = "a model, which has no folder for the monitor", "the folder of a run; or a model with --out"
         raise InputError(
-            where=str(options.subject), found=found, needed=needed, fix="Add --out FOLDER and --data CONFIG"
+            where=str(options.subject), found=problem, needed=needed, fix="Add --out FOLDER and --data CONFIG"
         )
     data = None if options.data is None else cli.read_config(options.data)
     folder = Path(options.out or options.subject)

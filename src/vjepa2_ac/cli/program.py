@@ -90,8 +90,8 @@ def _require_working_directory() -> None:
     try:
         Path.cwd()
     except OSError:
-        found, fix = "it is gone: it was deleted, or its disk went away", "Change to a folder that is there, with `cd`"
-        raise InputError(where="working directory", found=found, fix=fix) from None
+        problem, fix = "the folder does not exist any more", "Change to an existing folder with `cd`"
+        raise InputError(where="working directory", found=problem, fix=fix) from None
 
 
 def _complain(error: str) -> None:
@@ -116,14 +116,14 @@ def _print_package_warnings() -> Iterator[None]:
 
 
 def _parser() -> Parser:
-    parser = Parser(prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and know whether it helped.")
+    parser = Parser(prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and measure whether it improved.")
     parser.add_argument("--version", action="version", version=__version__, help="show the version")
     parser.epilog = "`vjepa2-ac COMMAND --help` begins with an example."
     groups: dict[str, list[Callable[[Commands], None]]] = {
-        "begin": [setup.add_demo, setup.add_init, setup.add_download, setup.add_doctor, setup.add_config_command],
-        "look": [data.add_data, evaluate.add_imagine, explore.add_explore],
+        "start": [setup.add_demo, setup.add_init, setup.add_download, setup.add_doctor, setup.add_config_command],
+        "inspect": [data.add_data, evaluate.add_imagine, explore.add_explore],
         "train": [train.add_encode, train.add_train, train.add_decoder_command],
-        "judge": [
+        "evaluate": [
             evaluate.add_evaluate,
             evaluate.add_compare,
             closed_loop.add_simulate,

@@ -22,11 +22,11 @@ from vjepa2_ac.reporter import Reporter
 
 _FIRST_LINE_S, _LINE_EVERY_S = 4.0, 10.0
 _WIDE = 120  # columns; at least this width shows a long bar
-_BESIDE_A_CELL = 3  # columns between two cells: a border and two spaces
+_CELL_BORDER = 3  # columns between two cells: a border and two spaces
 _WHOLE = 16  # characters; a longer word in a table, such as a path, may be split over lines
 _LONGEST_LINE = 100  # columns
 _COMMAND = r"(Next: )?(?<![\w/.-])(vjepa2-ac |(\S+ -m )?pip install )((?!   #).)*"
-_IN_ONE_PIECE = re.compile(rf"^ +|`[^`\n]*`|{_COMMAND}|(?<=\d) %", re.MULTILINE)
+_UNBREAKABLE = re.compile(rf"^ +|`[^`\n]*`|{_COMMAND}|(?<=\d) %", re.MULTILINE)
 _SPACE = "\ue000"  # stands for a non-breaking space
 
 
@@ -36,7 +36,7 @@ def wrapped(text: str) -> str:
     If a line has columns, which are separated by two or more spaces, continuation lines are indented to the last one.
     """
     width, lines = min(_LONGEST_LINE, console.width), []
-    for line in _IN_ONE_PIECE.sub(lambda match: match[0].replace(" ", _SPACE), text).split("\n"):
+    for line in _UNBREAKABLE.sub(lambda match: match[0].replace(" ", _SPACE), text).split("\n"):
         columns = re.match(r"(.{0,38} {2,})?", line.replace(_SPACE, " "))[0]  # type: ignore[index]  # always matches
         indent = " " * (len(columns) if columns.strip() else len(columns) + 2)
         style = textwrap.TextWrapper(width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
@@ -84,7 +84,7 @@ class MetricsTable(Table):
         words = [[cell_len(word) for text in of_column for word in text.split()] for of_column in texts]
         least = [max((size for size in sizes if size <= _WHOLE), default=1) for sizes in words]
         widths = [max(map(cell_len, of_column), default=1) for of_column in texts]
-        available = options.max_width - len(widths) * _BESIDE_A_CELL - 1
+        available = options.max_width - len(widths) * _CELL_BORDER - 1
         while sum(widths) > available and (reducible := [n for n, width in enumerate(widths) if width > least[n]]):
             widths[max(reducible, key=lambda n: widths[n])] -= 1
         for column, width in zip(self.columns, widths, strict=True):

@@ -45,10 +45,10 @@ def add_init(commands: cli.Commands) -> None:
     """Add `init` to a parser."""
     parser = cli.command(commands, "init", _init, "data/my_robot")
     cli.add(parser, "path PATH", "a folder or a URL; or droid; or sim, the simulated arm", cli.as_place)
-    cli.add(parser, "--out FILE", "the config to write (NAME.yaml, by the data's folder)", cli.as_path)
-    cli.add(parser, "--scratch", "a fresh predictor, on the encoder --model", action="store_true")
-    cli.add(parser, "--model MODEL", "another than the released", cli.as_model)
-    cli.add(parser, "--overwrite", "write over a config that is there", action="store_true")
+    cli.add(parser, "--out FILE", "the config to write (NAME.yaml, with the name of the data's folder)", cli.as_path)
+    cli.add(parser, "--scratch", "train a new predictor on the encoder --model", action="store_true")
+    cli.add(parser, "--model MODEL", "the base model (Meta's released model)", cli.as_model)
+    cli.add(parser, "--overwrite", "overwrite an existing config", action="store_true")
 
 
 def add_config_command(commands: cli.Commands) -> None:
@@ -62,10 +62,10 @@ def add_config_command(commands: cli.Commands) -> None:
 def add_download(commands: cli.Commands) -> None:
     """Add `download` to a parser."""
     parser = cli.command(commands, "download", _download, "vjepa2-ac-vitg")
-    cli.add(parser, "name NAME", "as --list shows it (vjepa2-ac-vitg, the world model, 11.7 GB)", nargs="?")
+    cli.add(parser, "name NAME", "a name from --list (vjepa2-ac-vitg, the world model, 11.7 GB)", nargs="?")
     cli.add(parser, "--to PATH", "the file to write (checkpoints/NAME.pt)", cli.as_path)
-    cli.add(parser, "--url", "another address of the same file than Meta's")
-    cli.add(parser, "--list", "show names, sizes and licences, and fetch nothing", action="store_true")
+    cli.add(parser, "--url", "another URL of the same file")
+    cli.add(parser, "--list", "list names, sizes and licences, without a download", action="store_true")
 
 
 def add_doctor(commands: cli.Commands) -> None:
@@ -167,14 +167,14 @@ def _config(options: argparse.Namespace) -> None:
 
     Choices:
       list    the configs that are included in the package
-      text    one of them with its comments, as a template for your config
+      text    a packaged config with its comments, as a template
       show    a config with all defaults
       schema  all keys with their types and ranges, as JSON schema
     """
-    what, of_one = options.what, options.what in {"show", "text"}
-    if of_one != (options.config is not None):
-        found = f"config {what} {options.config or 'without a file'}"
-        raise InputError(where="command line", found=found, needed=f"config {what}{' CONFIG' * of_one}")
+    what, needs_config = options.what, options.what in {"show", "text"}
+    if needs_config != (options.config is not None):
+        problem = f"config {what} {options.config or 'without a file'}"
+        raise InputError(where="command line", found=problem, needed=f"config {what}{' CONFIG' * needs_config}")
     if what == "schema":
         print(json.dumps(config_schema(), indent=2))
     elif what == "list":
@@ -209,7 +209,7 @@ def _download(options: argparse.Namespace) -> None:
     cli.show(f"Licence {known.licence}; from {url}; its size is checked")
     with cli.reporter() as reporter:
         download(url, path, published=known, reporter=reporter)
-    cli.show(f"It is in {path}. In a config:  {known.config_key}: {to_config_value(path)}")
+    cli.show(f"Saved to {path}. In a config:  {known.config_key}: {to_config_value(path)}")
 
 
 def _doctor(options: argparse.Namespace) -> int:

@@ -212,14 +212,14 @@ class TrainingConsole(ConsoleReporter):
             parts.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
         self._bar(step, self._steps, "  ".join(part for part in parts if part))
 
-    def on_validation(self, step: int, found: Validation) -> None:
+    def on_validation(self, step: int, validation: Validation) -> None:
         """Print the metrics of a validation; metrics.jsonl contains them for every horizon."""
-        errors = found.errors
+        errors = validation.errors
         true, zero, shuffled = (one_step_over_persistence(errors, actions).value for actions in ACTIONS)
         rollout = [estimate.value for estimate in over_persistence(errors, "rollout")]
         rank = "not measured (needs validation.ranking_clips and clips in which the robot moves)"
-        if found.ranking is not None:
-            measured = found.ranking.rank
+        if validation.ranking is not None:
+            measured = validation.ranking.rank
             share = f"{format_percent(measured.value)} % {format_interval(measured)}".rstrip()
             rank = f"{share} (0 % is best, chance 50 %)"
         show(

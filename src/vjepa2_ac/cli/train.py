@@ -20,16 +20,16 @@ def add_train(commands: cli.Commands) -> None:
     parser = cli.command(commands, "train", _train, "my_robot.yaml training.steps=1000")
     cli.add_config(parser, such_as="training.learning_rate=3e-4", what="a YAML config, or (--resume) a run's folder")
     cli.add(parser, "--resume", "resume the run in CONFIG; key=value changes its config", action="store_true")
-    cli.add(parser, "--check", "do everything that can fail, and stop before the first step", action="store_true")
-    cli.add(parser, "--allow-config-change", "go on with a run though the config is another", action="store_true")
+    cli.add(parser, "--check", "run all checks, and stop before the first step", action="store_true")
+    cli.add(parser, "--allow-config-change", "resume the run although the config has changed", action="store_true")
 
 
 def add_encode(commands: cli.Commands) -> None:
     """Add `encode` to a parser."""
     parser = cli.command(commands, "encode", _encode, "my_robot.yaml")
     cli.add_config(parser, such_as="data.cache_dtype=int8")
-    cli.add(parser, "--out FOLDER", "the cache, for data.source: latents (where data.cache finds it)", cli.as_place)
-    text = "ray: an actor on each GPU, or each core without one, of this machine; ray=ADDRESS: of a Ray cluster"
+    cli.add(parser, "--out FOLDER", "output folder, for data.source: latents (the folder of data.cache)", cli.as_place)
+    text = "ray: one actor per GPU (or per CPU core) of this machine; ray=ADDRESS: on a Ray cluster"
     cli.add(parser, "--engine ENGINE", text, _as_engine)
 
 
@@ -37,16 +37,16 @@ def add_decoder_command(commands: cli.Commands) -> None:
     """Add `decoder` to a parser."""
     parser = cli.command(commands, "decoder", _decoder, "my_robot.yaml")
     cli.add_config(parser, such_as="decoder.size=medium")
-    cli.add(parser, "--check", "do what can fail, and write nothing", action="store_true")
+    cli.add(parser, "--check", "run all checks, and write nothing", action="store_true")
 
 
 def add_export(commands: cli.Commands) -> None:
     """Add `export` to a parser."""
     parser = cli.command(commands, "export", _export, "runs/my_robot merged")
     cli.add(parser, "run RUN", "folder of a run", cli.as_path)
-    cli.add(parser, "folder FOLDER", "what is written: new or empty; official: or a .pt file", cli.as_path)
-    cli.add(parser, "overrides key=value", "model.base=PATH, if the base was moved", nargs="*")
-    text = "merged: for model.base; official: a .pt by Meta's names; hub: the adapter in PEFT's format, with a card"
+    cli.add(parser, "folder FOLDER", "output folder, new or empty; with --to official also a .pt file", cli.as_path)
+    cli.add(parser, "overrides key=value", "model.base=PATH, if the base model was moved", nargs="*")
+    text = "merged: a model for model.base; official: a .pt with Meta's tensor names; hub: PEFT's format with a card"
     cli.add(parser, "--to", text, choices=["merged", "official", "hub"], default="merged")
     cli.add_checkpoint(parser)
 
@@ -67,7 +67,7 @@ def _train(options: argparse.Namespace) -> None:
         fix = "To resume the run, add --resume"
         raise InputError(where=options.config, found="the folder of a run", needed="a config file", fix=fix)
     if options.resume:
-        cli.say_places_elsewhere(options.config)
+        cli.report_relocated_paths(options.config)
         config = read_run_config(path, options.overrides)
         require_base_of_run(config.model, path, options.words)
     else:
