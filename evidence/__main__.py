@@ -1,11 +1,12 @@
-"""Does LoRA fine-tuning help? Measure what is missing of both studies, then make docs/evidence.md with its plots.
+"""Run the missing measurements of both studies, and write docs/evidence.md with its plots.
 
-    python evidence --table                     # tables and plots from results/*.json, a minute (make evidence)
-    python evidence --only look --seeds 1       # a part of the methods study; resumes where it stopped
-    python evidence --study selection           # every checkpoint of 21 runs in closed loop
+    python evidence --table                     # write tables and plots from results/*.json (make evidence)
+    python evidence --only look --seeds 1       # run a part of the methods study; finished cells are skipped
+    python evidence --study selection           # measure every checkpoint of 21 runs in closed loop
 
-methods: each method adapts a base to a changed scene. selection: which number should select a checkpoint? Finished
-measurements are JSON files in the work folder; what the tables need of them is written to evidence/results.
+The methods study compares methods that adapt a base model to a changed scene. The selection study compares metrics that
+select a checkpoint. A finished measurement is a JSON file in the work folder; the values that the tables need are
+written to evidence/results.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def main() -> int:
-    """Run what is missing, then write tables and plots; return 1 where a cell failed."""
+    """Run the missing measurements, then write tables and plots; return 1 if a cell failed."""
     options = _parse()
     failed = 0
     if not options.table:
@@ -35,7 +36,7 @@ def main() -> int:
 
 
 def write(folder: Path) -> None:
-    """Write results, tables and plots of all that is measured."""
+    """Write the results, tables and plots of all measurements."""
     import results
     import selection
     import selection_tables
@@ -55,12 +56,20 @@ def write(folder: Path) -> None:
 def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--study", choices=("methods", "selection"), default="methods")
-    parser.add_argument("--folder", type=Path, default=Path("build/evidence"), help="data, bases, runs, measurements")
-    parser.add_argument("--seeds", type=int, default=5, help="at most; docs/evidence.md has those of each change")
-    parser.add_argument("--goals", type=int, default=20, help="of each cell; a row pools its seeds")
-    parser.add_argument("--workers", type=int, default=2, help="cells at once, one thread each")
-    parser.add_argument("--only", default="", help="cells whose name contains this")
-    parser.add_argument("--table", action="store_true", help="write tables and plots, run nothing")
+    parser.add_argument(
+        "--folder", type=Path, default=Path("build/evidence"), help="work folder: data, base models, runs, measurements"
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=5, help="largest number of seeds; docs/evidence.md has the number for each change"
+    )
+    parser.add_argument(
+        "--goals", type=int, default=20, help="number of goals of each cell; a table row pools its seeds"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=2, help="number of cells that run in parallel, with one thread each"
+    )
+    parser.add_argument("--only", default="", help="run only cells whose name contains this text")
+    parser.add_argument("--table", action="store_true", help="write tables and plots without running measurements")
     return parser.parse_args()
 
 
@@ -72,9 +81,10 @@ def _run_methods(options: argparse.Namespace) -> int:
     from results import KEPT, name_of
 
     cells = _missing(list(all_cells(options.seeds)), KEPT / "methods.json", name_of, options)
-    absent = {cell.shift for cell in cells if cell.shift in TASKS and not TASKS[cell.shift].is_there}
+    absent = {cell.shift for cell in cells if cell.shift in TASKS and not TASKS[cell.shift].is_installed}
     for task in sorted(absent):
-        print(f"{task} is left out: make worlds/{TASKS[task].program} installs its environment (docs/worlds.md)")
+        fix = f"Run `make worlds/{TASKS[task].program}` (docs/worlds.md)"
+        print(f"{task} is skipped: its environment is not installed. {fix}")
     cells = [cell for cell in cells if cell.shift not in absent]
     prepare(options.folder, {cell.shift for cell in cells}, options.seeds)
     return _in_processes(measure, [(cell, options.folder, options.goals) for cell in cells], options)
@@ -92,20 +102,20 @@ def _run_selection(options: argparse.Namespace) -> int:
 
 
 def _missing(cells: list[Any], kept: Path, name_of: Callable[[Any], str], options: argparse.Namespace) -> list[Any]:
-    """Return the cells that are to be measured."""
+    """Return the cells without a measurement."""
     (options.folder / options.study).mkdir(parents=True, exist_ok=True)
     known = {path.stem for path in (options.folder / options.study).glob("*.json")}
     known |= {name_of(one) for one in json.loads(kept.read_text())}
     missing = [cell for cell in cells if options.only in cell.name and cell.name not in known]
-    print(f"{len(missing)} of {len(cells)} cells are to be measured", flush=True)
+    print(f"measuring {len(missing)} of {len(cells)} cells", flush=True)
     return missing
 
 
 def _in_processes(do: Callable[..., Any], work: Sequence[tuple[Any, ...]], options: argparse.Namespace) -> int:
-    """Do work in processes of their own, and write each result; return how many failed.
+    """Run each call in a new process and write its result; return the number of failed calls.
 
     Raises:
-        BrokenProcessPool: A process was killed, most likely for its memory.
+        BrokenProcessPool: A process was killed, most likely because it used too much memory.
     """
     os.environ["OMP_NUM_THREADS"] = "1"
     context, failed = multiprocessing.get_context("spawn"), 0

@@ -31,12 +31,12 @@ class Task:
     program: str  # in examples/worlds, and the name of its environment
     before: tuple[str, ...]
     after: tuple[str, ...]
-    origin: str | None = None  # the task whose world before, and whose base, this one shares
-    seeds: int = 1  # more where methods can be told apart: one is enough to say that nobody solves it
+    origin: str | None = None  # the task with the same world before the change and the same base model
+    seeds: int = 1  # one seed suffices for a task that no method solves
 
     @property
-    def is_there(self) -> bool:
-        """Whether its environment is (`make worlds/NAME`)."""
+    def is_installed(self) -> bool:
+        """Whether the environment is installed (`make worlds/NAME`)."""
         return self._python.exists()
 
     @property
@@ -60,12 +60,12 @@ TASKS = {
 
 
 def origin_of(task: str) -> str:
-    """Return the task whose world before the change, and whose base, a task has."""
+    """Return the task whose world before the change and base model this task uses."""
     return TASKS[task].origin or task
 
 
 def data_of(folder: Path, task: str, when: str) -> DataConfig:
-    """Return the data of a task; after the change two thirds of the episodes may be trained on."""
+    """Return the data config of a task; after the change, two thirds of the episodes are for training."""
     task = task if when == "after" else origin_of(task)
     held_out = {"validation_share": 0.1, "test_share": 0.1 if when == "before" else 0.25}
     latents = {"cache": "auto", "cache_dir": str(folder / "latents"), "workers": 0}
@@ -76,7 +76,7 @@ def data_of(folder: Path, task: str, when: str) -> DataConfig:
 
 
 def record(folder: Path, task: str, when: str) -> None:
-    """Record the demonstrations of a task that are not there yet."""
+    """Record the missing demonstrations of a task."""
     of_after = EPISODES_LIFT if task == "Lift" else EPISODES_AFTER
     first, count = FIRST[when], EPISODES_BEFORE if when == "before" else of_after
     path = Path(data_of(folder, task, when).path)
@@ -87,7 +87,7 @@ def record(folder: Path, task: str, when: str) -> None:
 
 
 def problems(folder: Path, task: str, seed: int, goals: int, when: str = "after") -> tuple[Trials, ClosedLoopResult]:
-    """Return the problems, with a goal for each model step; kept, since the expert takes its time."""
+    """Return the problems, with a goal for each model step; they are stored, because the expert is slow."""
     word = "-before" if when == "before" else ""
     path = folder / "problems" / f"{task}{word}-{seed}-{goals}.pickle"
     if not path.exists():
@@ -103,14 +103,14 @@ def problems(folder: Path, task: str, seed: int, goals: int, when: str = "after"
 def closed_loop(
     folder: Path, task: str, policy: Policy, *, seed: int, goals: int, when: str = "after"
 ) -> dict[str, Any]:
-    """Return how a policy fares before or after the change; by `Trials` of the expert's own problems."""
+    """Return the results of a policy on the expert's problems, before or after the change."""
     trials, expert = problems(folder, task, seed, goals, when)
     with ExternalEnvironment(TASKS[task].command(when)) as world:
         return figures_of(run_trials(world, policy, trials), expert)
 
 
 def figures_of(result: ClosedLoopResult, expert: ClosedLoopResult) -> dict[str, Any]:
-    """Return distances of objects to their goal, what was solved, and how far the hand ends from the expert's (cm)."""
+    """Return the objects' distances to goals and the hand's final distance to the expert's (cm), and the successes."""
     ends = [np.stack([episode.states[-1, :3] for episode in each.episodes]) for each in (result, expert)]
     return {
         "distance_cm": np.round(result.distance_cm, 3).tolist(),

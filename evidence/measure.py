@@ -42,7 +42,7 @@ CLIPS = 128  # of held-out episodes
 
 
 def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
-    """Train a cell and return its figures, on one thread; `folder` is the work folder, which `prepare` filled."""
+    """Train a cell on one thread and return its metrics; `folder` is the work folder with the output of `prepare`."""
     torch.set_num_threads(1)
     config, method = config_of(cell, folder), method_of(cell.method)
     started = time.process_time()
@@ -72,9 +72,9 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
 
 
 def _prior(cell: Cell, config: Config, folder: Path) -> tuple[str, Mapping[str, Any]]:
-    """Train an action prior on a cell's demonstrations; return its folder, and how it does on held-out clips."""
-    place = folder / "priors" / cell.name
-    return str(place), train_prior(config, place).held_out
+    """Train an action prior on a cell's demonstrations; return its folder and its metrics on held-out clips."""
+    path = folder / "priors" / cell.name
+    return str(path), train_prior(config, path).held_out
 
 
 def made_with() -> dict[str, str]:
@@ -107,7 +107,7 @@ def goals_seed(cell: Cell) -> int:
 
 
 def baselines(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
-    """Return how policies without a model fare on the same goals."""
+    """Return the results of policies without a model on the same goals."""
     policies: list[Policy] = [ZeroActions(), RandomActions(PLANNING.limits, cell.seed)]
     policies += [Oracle(PLANNING.limits)] if cell.shift in SHIFTS else []
     result = {policy.name: closed_loop(cell, policy, folder, goals=goals) for policy in policies}
@@ -118,7 +118,7 @@ def baselines(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
 
 
 def closed_loop(cell: Cell, policy: Policy, folder: Path, *, goals: int) -> dict[str, Any]:
-    """Return distances to the goal (cm) before the first step and after each, and what was solved."""
+    """Return the distances to the goal (cm) before the first and after each step, and the solved problems."""
     seed = goals_seed(cell)
     if cell.shift not in SHIFTS:
         when = "before" if cell.method == BEFORE else "after"
@@ -128,7 +128,7 @@ def closed_loop(cell: Cell, policy: Policy, folder: Path, *, goals: int) -> dict
 
 
 def _rollouts(shift: str, seed: int, goals: int) -> Iterator[BenchmarkOptions]:
-    """Yield what is to be reached: in one world, or each goal in another that no episode was recorded in."""
+    """Yield the goals: all in one world, or each in a new world in which no episode was recorded."""
     world = SHIFTS[shift]
     if isinstance(world, Domain):
         yield BenchmarkOptions("reach", world, goals, seed)
@@ -139,7 +139,7 @@ def _rollouts(shift: str, seed: int, goals: int) -> Iterator[BenchmarkOptions]:
 
 
 def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
-    loaded = load_subject(run, NEWEST)  # as it was made: the last
+    loaded = load_subject(run, NEWEST)  # the last checkpoint
     assert loaded.checkpoint is not None, "a run"
     counts = count_parameters(loaded.config, loaded.world_model.sizes)
     count = counts.trained if loaded.config.adapter.kind == "lora" else counts.predictor

@@ -1,4 +1,4 @@
-"""Measure a model without a robot: numbers that may predict its success in closed loop, lower is better for each."""
+"""Measure offline metrics that may predict a model's success in closed loop; lower is better for each."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOVES = 32  # clips whose moves are ranked
 
 @torch.no_grad()
 def offline_figures(model: WorldModel, space: ActionSpace, held_out: Sequence[LatentBatch]) -> dict[str, float]:
-    """Return what is measured on clips of held-out episodes."""
+    """Return the offline metrics on clips of held-out episodes."""
     true, predicted = LatentSums(), LatentSums()
     for batch in held_out:
         true.add(batch.latents[:, 1:], batch.episode_ids)
@@ -29,7 +29,7 @@ def offline_figures(model: WorldModel, space: ActionSpace, held_out: Sequence[La
         predicted.add(rolled, batch.episode_ids)
     distribution = compare_distributions(predicted, true)
     rows = [(batch, row) for batch in held_out for row in range(len(batch.starts))]
-    chosen = [rows[place] for place in np.linspace(0, len(rows) - 1, MOVES).astype(int)]
+    chosen = [rows[index] for index in np.linspace(0, len(rows) - 1, MOVES).astype(int)]
     moves = [move for batch, row in chosen for move in select_moves(batch, row, space, 0.075)]
     ranking = rank_actions(model, moves, space, ProbeOptions(samples=32), seed=0)
     return {

@@ -1,4 +1,4 @@
-"""Make what cells need: data sets, base models, and predictors with fresh weights."""
+"""Make the data sets, base models and randomly initialised predictors that cells need."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from vjepa2_ac.training.loop import train
 
 BUILTIN = "builtin:sim-tiny"
 EPISODES_A, EPISODES_SHIFTED = 400, 100
-SEED_A, SEED_SHIFTED = 11, 21  # of recordings; another than those of the demo and its base
+SEED_A, SEED_SHIFTED = 11, 21  # seeds of recordings, which differ from those of the demo and its base model
 OF_A_WORLD = (
     "training.steps=4000", "training.learning_rate=4e-3", "training.warmup_steps=50", "training.allow_weak_base=true",
 )  # fmt: skip
-"""How the base of a world is trained: as `configs/pick.yaml`."""
-BASE_CONFIG = "builtin:demo_base"  # the sizes and settings of the demo's base
+"""Options of the training of a world's base model, as in `configs/pick.yaml`."""
+BASE_CONFIG = "builtin:demo_base"  # the sizes and settings of the demo's base model
 
 
 def data_a(folder: Path) -> DataConfig:
@@ -54,7 +54,7 @@ def data_before(folder: Path, shift: str) -> DataConfig:
 
 
 def data_shifted(folder: Path, shift: str) -> DataConfig:
-    """Return the data of a shifted domain: half of its episodes may be trained on, the others are held out."""
+    """Return the data of a shifted domain: half of the episodes are for training, the others are held out."""
     if shift not in SHIFTS:
         return data_of(folder, shift, "after")
     update = {"path": str(folder / f"data-{shift}"), "validation_share": 0.12, "test_share": 0.35}
@@ -73,17 +73,17 @@ def prepare_world(folder: Path, task: str, reporter: Reporter = SILENT) -> None:
     """Make what the cells of a world need: demonstrations before and after its change, and a base of those before."""
     for when in ("before", "after"):
         record(folder, task, when)
-        keep_latents(data_of(folder, task, when), BUILTIN)  # all share its encoder
+        keep_latents(data_of(folder, task, when), BUILTIN)  # all models share this encoder
     base = Path(base_model(folder, "one camera", 0, task))
     if not base.exists():
         config = load_config(BASE_CONFIG, [f"run_dir={folder / f'run-{base.name}'}", *OF_A_WORLD])
-        start = config.model.with_base(BUILTIN)  # has seen an arm, no such world
+        start = config.model.with_base(BUILTIN)  # pre-trained on the simulated arm, not on this world
         config = config.model_copy(update={"data": data_of(folder, task, "before"), "model": start})
         export_run(train(config, reporter), base)
 
 
 def prepare(folder: Path, shifts: Collection[str], seeds: int, reporter: Reporter = SILENT) -> None:
-    """Make everything that is not there yet; of our own arm some 25 minutes on one core, most of it its first base."""
+    """Make all missing inputs. For the simulated arm this takes about 25 minutes on one core."""
     folder.mkdir(parents=True, exist_ok=True)
     for seed in range(seeds):
         _save_fresh_predictor(Path(base_model(folder, "none", seed)), seed)
@@ -104,29 +104,29 @@ def prepare(folder: Path, shifts: Collection[str], seeds: int, reporter: Reporte
 
 
 def keep_latents(data: DataConfig, base: str) -> None:
-    """Keep the latents of every episode: cells leave out different ones. Nothing to do where they are there."""
+    """Encode the latents of all missing episodes; each cell uses a different subset."""
     model = ModelConfig(base=base, dtype="float32")
     encode_config(Config(run_dir="none", data=data, model=model, training=TRAINING))
 
 
 def encoded(config: Config, model: WorldModel, split: Split, clips: int) -> list[LatentBatch]:
-    """Return so many clips of a split, from the latents that training used."""
+    """Return clips of a split, from the latents that training used."""
     dataset = use_finished_cache(config, open_dataset(config.data), model)
     return [encode(model, batch, chunk=64) for batch in read_clips(dataset, split, clips=clips, batch_size=32)]
 
 
 def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...]:
-    """Return which training episodes are *left out* so that `count` remain, drawn by the seed.
+    """Return the training episodes to *exclude* so that `count` remain, drawn by the seed.
 
     Raises:
-        ValueError: There are not as many.
+        ValueError: There are fewer than `count` training episodes.
     """
     dataset = open_dataset(data)
     names = [dataset.table.identity(int(number)) for number in np.flatnonzero(dataset.split_mask("train"))]
     if len(names) < count:
         raise ValueError(f"{data.path} has {len(names)} training episodes, not {count}")
     order = np.random.default_rng([seed, 77]).permutation(len(names))
-    return tuple(sorted(names[place] for place in order[count:]))
+    return tuple(sorted(names[index] for index in order[count:]))
 
 
 def _record(data: DataConfig, domain: str, episodes: int, seed: int) -> None:
@@ -135,7 +135,7 @@ def _record(data: DataConfig, domain: str, episodes: int, seed: int) -> None:
 
 
 def _save_fresh_predictor(folder: Path, seed: int) -> None:
-    """Write the frozen encoder that all share with a predictor of fresh weights, which starts close to copying."""
+    """Write the shared frozen encoder with a randomly initialised predictor, which starts close to persistence."""
     if not folder.exists():
         model = load_base(ModelConfig(base=BUILTIN, dtype="float32"), seed=0)
         model.predictor = WorldModel.random(model.sizes, seed=1000 + seed, near_persistence=True).predictor

@@ -35,7 +35,7 @@ Figures = dict[str, Any]
 def read_all(
     folder: Path, kept: Path, compact: Callable[[Figures], Figures], name_of: Callable[[Figures], str]
 ) -> list[Figures]:
-    """Return the results in a work folder, and those of the repository that are not among them, ordered by name."""
+    """Return the results of a work folder, and the stored results that it lacks, ordered by name."""
     known = json.loads(kept.read_text()) if kept.exists() else []
     measured = [compact(json.loads(path.read_text())) for path in folder.glob("*.json")]
     by_name = {name_of(one): one for one in (*known, *measured)}
@@ -43,7 +43,7 @@ def read_all(
 
 
 def write_all(path: Path, results: Sequence[Figures]) -> None:
-    """Write results, one in a line, so that a difference shows which changed."""
+    """Write one result per line, so that a diff shows which results changed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = ",\n".join(json.dumps(one, separators=(",", ":")) for one in results)
     write_atomically(path, f"[\n{lines}\n]\n".encode())
@@ -64,7 +64,7 @@ def name_of(one: Figures) -> str:
 
 
 def compact(measured: Figures) -> Figures:
-    """Return what the tables and plots of the methods study need of a measurement."""
+    """Return the values of a measurement that the tables and plots of the methods study need."""
     kept: Figures = {"cell": {key: value for key, value in measured["cell"].items() if key != "name"}}
     kept |= {
         key: measured[key] for key in ("trained_share", "adapter_mb", "cpu_minutes", "made_with") if key in measured
@@ -81,7 +81,7 @@ def compact(measured: Figures) -> Figures:
 
 
 def _episodes(measured: Figures) -> Figures:
-    """Return where episodes of a closed loop ended, and which of them were solved."""
+    """Return the final distances of closed-loop episodes, and which of them were solved."""
     kept: Figures = {"ends_cm": [way[-1] for way in measured["distance_cm"]]}
     if "visited" in measured:
         kept["visited"] = measured["visited"]
@@ -122,7 +122,7 @@ def main_cells(results: Sequence[Figures], base: str, method: str, shift: str = 
 
 
 def of_policy(results: Sequence[Figures], base: str, name: str, shift: str = "look") -> list[Figures]:
-    """Return how policies without a model fare on the goals of a base's cells."""
+    """Return the results of a policy without a model on the goals of a base model's cells."""
     chosen = pick(results, shift=shift, base=base, method="zero-shot")
     return [{"reach": {"l1": one["baselines"][name]}} for one in chosen if "baselines" in one]
 

@@ -1,4 +1,4 @@
-"""The selection study: does a lower error plan better? Low-diversity and diverse demonstrations, every checkpoint."""
+"""The selection study: do checkpoints with a lower error plan better, with low-diversity and diverse data?"""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ OFFLINE = {
     "ranking": ("ranking.rank", 1),
     "spread": ("ranking.spread", -1),
 }
-"""What `evaluate` measures of a checkpoint: the key of a row, and a sign that makes lower better."""
+"""Metrics of `evaluate`: the key of a row, and the sign with which lower is better."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Cell:
 
 
 def all_cells(seeds: int) -> Iterator[Cell]:
-    """Yield the checkpoints of every run, those that matter most first."""
+    """Yield the checkpoints of every run, the most important runs first."""
     for seed in range(seeds):
         for motions in RECIPES:
             yield from cells_of(Run(motions, "LoRA", seed))
@@ -99,7 +99,7 @@ def cells_of(run: Run) -> list[Cell]:
 
 
 def prepare(folder: Path) -> None:
-    """Record what is missing: demonstrations, and random worlds as the base was trained on, to replay."""
+    """Record the missing demonstrations, and the random worlds of the base model's training for replay."""
     specs: dict[str, RecordingSpec] = {
         name: RecordingSpec(WORLD, seed=RECORDED, recipe=recipe) for name, recipe in RECIPES.items()
     }
@@ -143,8 +143,8 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     rows = [row for row in read_metrics_log(home / "metrics.jsonl") if row["kind"] == "validation"]
     (validated,) = (row for row in rows if row["step"] == cell.step)
     probes = ProbeOptions(ranking_clips=24, samples=32, landscape_clips=4, nodes=5, examples=0)
-    asked = EvaluationOptions(clips=48, checkpoint=step, against=(), probes=probes)
-    evaluation = evaluate_subject(str(home), asked)
+    options = EvaluationOptions(clips=48, checkpoint=step, against=(), probes=probes)
+    evaluation = evaluate_subject(str(home), options)
     model = load_subject(home, step).world_model
     if model.adaptation is not None:
         merge_adapter(model)
@@ -170,7 +170,7 @@ def run_of(one: dict[str, Any]) -> Run:
 
 
 def compact(measured: dict[str, Any]) -> dict[str, Any]:
-    """Return what the tables need of a measurement."""
+    """Return the values of a measurement that the tables need."""
     ends = [actions[-1] for actions in measured["distance_cm"]]
     validation = measured["validation"]
     kept = {
@@ -181,6 +181,6 @@ def compact(measured: dict[str, Any]) -> dict[str, Any]:
         "reached": sum(end < REACHED_CM for end in ends),
         "goals": len(ends),
     }
-    if not measured["cell"]["cure"]:  # correlations are of runs without a cure
+    if not measured["cell"]["cure"]:  # correlations are computed on runs without a cure
         kept["offline"] = measured["offline"]
     return rounded(kept)  # type: ignore[no-any-return]  # a mapping stays one
