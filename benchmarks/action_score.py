@@ -1,4 +1,4 @@
-"""How near do plans of three steps end to the demonstrations? The Action Score of JEPA-WMs, on recorded poses.
+"""Compute the Action Score of JEPA-WMs: how close do plans of three steps end to the demonstrations?
 
     python benchmarks/action_score.py checkpoints/vjepa2-ac-vitg.pt franka.yaml --clips 64
 
@@ -82,11 +82,16 @@ def energies(
 def main(words: Sequence[str] | None = None) -> None:
     """Measure a run or a model and print the scores."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("subject", help="folder of a run, or what model.base takes")
-    parser.add_argument("config", help="the data, with clips of four frames or more")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="of the config")
+    parser.add_argument("subject", help="folder of a run, or a value of model.base")
+    parser.add_argument("config", help="config of the data, with clips of four frames or more")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="override of a config key")
     parser.add_argument("--clips", type=int, default=64)
-    parser.add_argument("--samples", type=int, default=PROTOCOL.samples, help="another number than the published one")
+    parser.add_argument(
+        "--samples",
+        type=int,
+        default=PROTOCOL.samples,
+        help="samples per iteration (default: %(default)s, as published)",
+    )
     options = parser.parse_args(words)
     config = load_config(options.config, options.overrides)
     model = load_subject(options.subject, config=None if is_run(options.subject) else config).world_model
@@ -121,7 +126,7 @@ def main(words: Sequence[str] | None = None) -> None:
     for what, score in zip(("plans", "zero action"), bootstrap(_score, columns, ids), strict=True):
         print(f"{what}: Action Score {score:.1f} (best 80; 95 % interval over episodes)")
     plans_cm, zero_cm = 100 * columns[0].mean(axis=0)
-    print(f"mean error of the end, cm: plans {plans_cm:.1f}, zero action {zero_cm:.1f}")
+    print(f"mean distance of the end from the demonstration: plans {plans_cm:.1f} cm, zero action {zero_cm:.1f} cm")
 
 
 def _score(sums: np.ndarray) -> np.ndarray:

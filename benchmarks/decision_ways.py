@@ -1,4 +1,4 @@
-"""How can a decision be made, and how far are two of them apart?"""
+"""Variants of computing a decision, and the difference between two decisions."""
 
 from __future__ import annotations
 

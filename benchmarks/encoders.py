@@ -1,4 +1,4 @@
-"""Which encoder should I take? What each published one costs, by the arithmetic of `vjepa2-ac doctor`.
+"""Measure the cost of each published encoder, and compare with the estimates of `vjepa2-ac doctor`.
 
     python benchmarks/encoders.py               # all of them
     python benchmarks/encoders.py --only ViT-B  # those whose name has this in it; writes nothing
@@ -68,9 +68,13 @@ class Cost:
 def main(given: Sequence[str] | None = None) -> None:
     """Measure, print the table and write it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="where table and numbers go")
-    parser.add_argument("--only", default="", help="encoders whose name has this in it; writes nothing")
-    parser.add_argument("--frames", type=int, default=16, help="at once, where speed is measured")
+    parser.add_argument(
+        "--out", type=Path, default=Path("benchmarks/results"), help="folder for the table and the metrics"
+    )
+    parser.add_argument(
+        "--only", default="", help="measure only encoders whose name contains this text, and write nothing"
+    )
+    parser.add_argument("--frames", type=int, default=16, help="frames per batch in the speed measurement")
     add_basics(parser)
     add_repeats(parser)
     options = settle(parser.parse_args(given), QUICK)
@@ -91,7 +95,7 @@ def print_speeds(options: argparse.Namespace, given: list[str]) -> None:
     """Print and add the frames a second of each encoder, of random weights, at the first image size."""
     prepare(options)
     ceiling = measure_matmul_speed(torch.device(options.device), torch.bfloat16)
-    print(f"{introduction(options)}; bfloat16, {options.frames} frames at once, ceiling {ceiling / 1e12:.3g} TFLOP/s")
+    print(f"{introduction(options)}; bfloat16, {options.frames} frames per batch, peak {ceiling / 1e12:.3g} TFLOP/s")
     print(f"{'':12} {'frames/s':>9} {'MFU':>6} {'peak GB':>8}")
     rows = Rows(options.json, **about(options, given))
     for name, (encoder, _) in published().items():

@@ -1,4 +1,4 @@
-"""How long does it take to index DROID on Google Cloud Storage, 40 ms away?
+"""Measure the time to index DROID on Google Cloud Storage, at a latency of 40 ms.
 
     python benchmarks/index.py [--shards 128] [--in-flight 64 128] [--latency-ms 40]
 
@@ -54,9 +54,11 @@ def main(options: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--shards", type=int, default=128, help="shards that are served (default: %(default)s)")
     parser.add_argument(
-        "--in-flight", type=int, nargs="+", default=[64, 128], help="reads at once (default: %(default)s)"
+        "--in-flight", type=int, nargs="+", default=[64, 128], help="concurrent reads (default: %(default)s)"
     )
-    parser.add_argument("--latency-ms", type=float, default=40.0, help="of every answer (default: %(default)s)")
+    parser.add_argument(
+        "--latency-ms", type=float, default=40.0, help="latency of each response (default: %(default)s)"
+    )
     arguments = parser.parse_args(options)
     latency_s = arguments.latency_ms / 1e3
     print(f"{arguments.shards} shards of {PER_SHARD} episodes, {arguments.latency_ms:g} ms a read\n")

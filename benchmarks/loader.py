@@ -82,7 +82,7 @@ print(min(seconds))
 def main(options: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--path", help="a data set in DROID's RLDS schema; default: one that is drawn for the purpose")
+    parser.add_argument("--path", help="a data set in DROID's RLDS schema; default: a synthetic data set")
     parser.add_argument("--clips", type=int, default=48, help="clips per measurement (default: %(default)s)")
     parser.add_argument("--stride", type=int, default=4, help="control steps per model step (default: %(default)s)")
     parser.add_argument("--tfds-python", help="interpreter that can import tensorflow_datasets")

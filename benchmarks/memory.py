@@ -1,4 +1,4 @@
-"""In how much memory? Peaks are measured with nothing else there: on CUDA by letting go of it, else in a process each.
+"""Measure peak memory in isolation: on CUDA after releasing all other memory, else in a new process.
 
 On CUDA the peak is that of PyTorch's allocator, on a CPU what is resident.
 """

@@ -1,4 +1,4 @@
-"""What does a decision cost in the official notebook? Its planner on its predictor, as the notebook calls them.
+"""The official notebook's planner and predictor, called as in the notebook, as a baseline for decisions.
 
 A checkout of facebookresearch/vjepa2 is imported; nothing of it is here. Its own ways are kept: all samples at once,
 the whole sequence again for every step, a dense mask, rotary tables in every layer, a predicted pose of one sample

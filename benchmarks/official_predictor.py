@@ -1,4 +1,4 @@
-"""What does a training step cost in the official code? Its predictor with plain PEFT LoRA, trained the way it trains.
+"""The official predictor with plain PEFT LoRA and the official training step, as a baseline for training.
 
 A checkout of facebookresearch/vjepa2 is imported; nothing of it is here. Its own ways are kept: float32 weights under
 autocast, rotary tables in every layer, a dense mask that is brought to the device in every pass, all steps computed

@@ -1,4 +1,4 @@
-"""Everything that needs a GPU, once: training step, memory, planning, encoders.
+"""Run all benchmarks that need a GPU: training step, memory, planning, encoders.
 
     python benchmarks/on_gpu.py --official ../vjepa2           # all of it: 10 to 15 minutes on an H100
     python benchmarks/on_gpu.py --only graph official --out FOLDER
@@ -133,10 +133,10 @@ def run(part: Part, options: argparse.Namespace) -> None:
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/gpu"), help="folder for logs and figures")
-    parser.add_argument("--official", type=Path, default=BESIDE, help="checkout (default: vjepa2 beside this project)")
-    parser.add_argument("--quick", action="store_true", help="tiny sizes on the CPU: whether it works")
-    parser.add_argument("--only", nargs="+", choices=[part.name for part in PARTS], help="some parts (default: all)")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/gpu"), help="folder for logs and metrics")
+    parser.add_argument("--official", type=Path, default=BESIDE, help="checkout (default: ../vjepa2)")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes on the CPU, to test the program")
+    parser.add_argument("--only", nargs="+", choices=[part.name for part in PARTS], help="parts to run (default: all)")
     parser.add_argument("--part", help=argparse.SUPPRESS)
     return parser.parse_args(arguments)
 

@@ -1,4 +1,4 @@
-"""How long does a decision take, and what share of the machine does it use? Ours, plain, and the official notebook's.
+"""Measure time and utilisation of a decision: this package, an unoptimised variant, and the official notebook.
 
     python benchmarks/planning.py --threads 1 --horizon 1 2 4 --dtype float32
     python benchmarks/planning.py --official ../vjepa2 --threads 1
@@ -160,7 +160,7 @@ def profile_decision(decide: Callable[[], object], bench: Bench, rows: Rows, nam
     rows.add({**named, "waits": found.waits, "dearest": found.dearest(device)})
     print(found.events.table(sort_by=self_time(device), row_limit=PROFILED_ROWS, max_name_column_width=40))
     if device != "cpu":
-        print(f"the host waited, in {bench.options.iterations} iterations: {found.waits}")
+        print(f"host synchronisations in {bench.options.iterations} iterations: {found.waits}")
 
 
 def memory_row(options: argparse.Namespace, given: list[str], dtype: str, horizon: int, way: Way) -> Row:
@@ -194,22 +194,29 @@ def names_of(row: Row) -> str:
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--layers", type=int, help="of the predictor (default: 24; 2 on a CPU)")
-    parser.add_argument("--width", type=int, default=1024, help="of the predictor, 64 a head")
+    parser.add_argument("--layers", type=int, help="layers of the predictor (default: 24; 2 on a CPU)")
+    parser.add_argument("--width", type=int, default=1024, help="width of the predictor, a multiple of 64")
     parser.add_argument("--latent-dim", type=int, default=1408, help="width of a latent, a multiple of 64")
     parser.add_argument("--image-size", type=int, default=256)
-    parser.add_argument("--samples", type=int, help="of an iteration (default: 800; 8 on a CPU)")
-    parser.add_argument("--iterations", type=int, help="of a decision (default: 10; 2 on a CPU)")
+    parser.add_argument("--samples", type=int, help="samples per iteration (default: 800; 8 on a CPU)")
+    parser.add_argument("--iterations", type=int, help="iterations per decision (default: 10; 2 on a CPU)")
     parser.add_argument("--horizon", type=int, nargs="+", help="model steps of a plan (default: 1 2; 2 4 on a CPU)")
-    parser.add_argument("--at-once", type=int, nargs="+", help="samples at once: a line each (default: 64; 8 on a CPU)")
+    parser.add_argument(
+        "--at-once", type=int, nargs="+", help="batch sizes of samples, one row each (default: 64; 8 on a CPU)"
+    )
     parser.add_argument("--dtype", nargs="+", choices=("float32", "bfloat16"), help="default: bfloat16; CPU: float32")
     add_options(parser)
-    parser.add_argument("--compile", action="store_true", help="ours once more with compiled blocks")
+    parser.add_argument("--compile", action="store_true", help="also measure this package with compiled blocks")
     parser.add_argument(
-        "--adapter", action=argparse.BooleanOptionalAction, default=True, help="ours once more with an adapter on"
+        "--adapter",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also measure this package with an adapter",
     )
     parser.add_argument(
-        "--profile", action="store_true", help="say where the time of ours goes, and on CUDA how often the host waits"
+        "--profile",
+        action="store_true",
+        help="print a profile of this package, and on CUDA the number of host synchronisations",
     )
     parser.add_argument("--memory-of", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
@@ -229,23 +236,23 @@ def same_ways(bench: Bench, horizon: int, rows: Rows) -> list[Way]:
 
 
 def chooses_the_same(bench: Bench, way: Way, horizon: int, rows: Rows, named: Row) -> bool:
-    """Return whether a way decides as ours does, and say so."""
+    """Return whether a variant chooses the same actions as this package, and print the result."""
     found = bench.difference(way, horizon)
     rows.add({**named, "difference": str(found), "is_none": found.is_none})
-    told = "" if found.is_none else ": NO RATIO, for it chooses others"
+    told = "" if found.is_none else ". No ratio is reported, because the actions differ"
     print(f"horizon {horizon}, {way.name}: {found} (float32){told}")
     return found.is_none
 
 
 def candidates(bench: Bench) -> list[Way]:
-    """Return all ways that are asked for."""
+    """Return all requested variants."""
     options = bench.options
     kinds = (False, True) if options.compile else (False,)
     ours = [Way.ours(count, compiled=compiled) for count in options.at_once for compiled in kinds]
     adapted = [Way.ours(options.at_once[0], compiled=compiled, adapter=True) for compiled in kinds]
     official = [Way(OFFICIAL, options.samples)] if bench.has_official else []
     if not official:
-        print(f"official: skipped, for there is no {options.official / PLANNER}")
+        print(f"official: skipped, needs {options.official / PLANNER}, found no such file")
     return [Way(PLAIN, options.at_once[0]), *official, *ours, *(adapted if options.adapter else ())]
 
 

@@ -1,4 +1,4 @@
-"""What is timed by `planning.py`? A decision: ours, the same without what makes it fast, and the official one."""
+"""The decisions that `planning.py` times: this package, an unoptimised variant, and the official notebook."""
 
 from __future__ import annotations
 

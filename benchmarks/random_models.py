@@ -1,4 +1,4 @@
-"""What is measured where no weights are needed? Models with random ones, drawn on the device in no time."""
+"""Models with random weights, initialised on the device, for measurements that need no trained weights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What did each row say? Kept on disk as soon as it is there; one that fails says so, and the others go on."""
+"""Collect the rows of a benchmark and write each to disk at once; after a failed row the others continue."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from vjepa2_ac.storage import write_atomically
 Row = dict[str, Any]
 Result = TypeVar("Result")
 
-OUT_OF_MEMORY = "out of memory"  # which is a result, and no failure
+OUT_OF_MEMORY = "out of memory"  # a result, not a failure
 FAILED = "failed"
 _LONGEST = 200  # characters of an error in a row
 
 
 class Rows:
-    """All rows of a benchmark. The file is replaced as a whole: whatever ends the program leaves what was there.
+    """All rows of a benchmark. The file is replaced atomically, so an interruption keeps the previous rows.
 
     Args:
         file: Where rows are written as JSON; None: nowhere.

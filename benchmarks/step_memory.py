@@ -1,4 +1,4 @@
-"""How much memory does a training step take, alone on the device, and what batch fits into it?"""
+"""Measure the memory of a training step in isolation, and find the largest batch that fits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Episodes as long and as large as DROID's, drawn for measurements: noise as smooth as a camera's picture."""
+"""Synthetic episodes with the length and size of DROID's, with noise as smooth as a camera image."""
 
 from __future__ import annotations
 

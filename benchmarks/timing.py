@@ -1,7 +1,7 @@
-"""How long does each way take? Ways to do one thing take turns, so that a busy machine slows them alike.
+"""Time variants of one computation. They take turns, so that load on the machine slows all of them equally.
 
-On a CPU the process's own time over its threads counts, else wall time. A way that fails says so and takes no more
-turns. On CUDA a way does not count in whose turns the allocator had to give memory back to go on.
+On a CPU the process time divided by the number of threads is measured, otherwise wall time. A variant that fails is
+reported and not repeated. On CUDA, a variant is discarded if the allocator had to release memory during its turns.
 """
 
 from __future__ import annotations
@@ -31,27 +31,29 @@ _REPEATS = {"cuda": (10, 3), "cpu": (3, 1)}  # that count, and to warm up: a GPU
 
 
 def add_basics(parser: argparse.ArgumentParser) -> None:
-    """Add what every benchmark of this folder takes that computes on a device."""
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: whether it works")
+    """Add the options of all benchmarks that compute on a device."""
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, to test the program")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int, default=0, help="0: as torch chooses")
-    parser.add_argument("--json", type=Path, help="file for all figures, written anew after every row")
+    parser.add_argument("--threads", type=int, default=0, help="number of threads; 0: the default of PyTorch")
+    parser.add_argument("--json", type=Path, help="file for all metrics, rewritten after every row")
 
 
 def add_repeats(parser: argparse.ArgumentParser) -> None:
-    """Add how often something is timed."""
-    parser.add_argument("--repeats", type=int, help="of which the median counts (default: 10; 3 on a CPU)")
-    parser.add_argument("--warm-up", type=int, help="rounds before that do not count (default: 3; 1 on a CPU)")
+    """Add the options for the number of rounds."""
+    parser.add_argument(
+        "--repeats", type=int, help="timed rounds, of which the median is reported (default: 10; 3 on a CPU)"
+    )
+    parser.add_argument("--warm-up", type=int, help="untimed rounds before them (default: 3; 1 on a CPU)")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add what every benchmark beside the official code takes: where, what, how often, against which checkout."""
+    """Add the options of benchmarks that compare with the official code."""
     add_basics(parser)
     add_repeats(parser)
     switch = argparse.BooleanOptionalAction
-    parser.add_argument("--official", type=Path, default=BESIDE, help="checkout (default: vjepa2 beside this project)")
+    parser.add_argument("--official", type=Path, default=BESIDE, help="checkout (default: ../vjepa2)")
     parser.add_argument("--time", action=switch, default=True, help="measure time")
-    parser.add_argument("--memory", action=switch, default=True, help="measure peak memory, in a pass of its own")
+    parser.add_argument("--memory", action=switch, default=True, help="measure peak memory, in a separate pass")
 
 
 def settle(options: argparse.Namespace, quick: Mapping[str, Any]) -> argparse.Namespace:

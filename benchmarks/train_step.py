@@ -1,4 +1,4 @@
-"""How long does a training step take, and what share of the machine does it use? Ours against the official predictor's.
+"""Measure time and utilisation of a training step, compared with the official predictor's.
 
     python benchmarks/train_step.py --layers 4 --frames 8 16 --dtype float32 bfloat16 --official ../vjepa2
     python benchmarks/train_step.py --device cuda --batch 1 2 8 --checkpointing off on --attention auto per_step dense
@@ -179,7 +179,7 @@ def choose_ways(bench: Bench, options: argparse.Namespace, rows: Rows) -> list[s
     plain = ["dense", *(way for way in ours if way != "dense")] if options.time else ours  # memory has no baseline
     print(f"ours: {trainable_report(bench.model)}")
     if not has_checkout(options):
-        print(f"official: skipped, for there is no {options.official / PREDICTOR}")
+        print(f"official: skipped, needs {options.official / PREDICTOR}, found no such file")
         return plain
     named = {"measured": "same loss and gradients", "dtype": str(bench.dtype).removeprefix("torch."), "way": OFFICIAL}
     if rows.attempt(partial(is_official_the_same, bench, rows, named), **named):
@@ -190,7 +190,7 @@ def choose_ways(bench: Bench, options: argparse.Namespace, rows: Rows) -> list[s
 
 
 def is_official_the_same(bench: Bench, rows: Rows, named: Row) -> bool:
-    """Return whether the official predictor computes what ours does, and say so."""
+    """Return whether the official predictor computes the same, and print the result."""
     difference = bench.compare()
     rows.add({**named, "difference": difference})
     count = sum(parameter.numel() for parameter in bench.official.trained)
@@ -198,38 +198,44 @@ def is_official_the_same(bench: Bench, rows: Rows, named: Row) -> bool:
     if difference is None:
         print("official: the same loss and gradients on the same weights (float32)")
         return True
-    print(f"official: NO RATIO, for it does not compute the same: {difference}")
+    print(f"official: no ratio is reported, because the results differ: {difference}")
     return False
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--layers", type=int, help="of the predictor (default: 24; 2 on a CPU)")
-    parser.add_argument("--width", type=int, default=1024, help="of the predictor, 64 a head")
-    parser.add_argument("--latent-dim", type=int, default=1408, help="width of the encoder, 64 a head")
+    parser.add_argument("--layers", type=int, help="layers of the predictor (default: 24; 2 on a CPU)")
+    parser.add_argument("--width", type=int, default=1024, help="width of the predictor, a multiple of 64")
+    parser.add_argument("--latent-dim", type=int, default=1408, help="width of the encoder, a multiple of 64")
     parser.add_argument("--image-size", type=int, default=256)
     parser.add_argument(
         "--source",
         nargs="+",
         choices=("cache", "pixels"),
         default=["cache"],
-        help="pixels: latents are made in the step",
+        help="pixels: frames are encoded in the step",
     )
     parser.add_argument("--encoder", action="store_true", help="the same as --source pixels")
-    parser.add_argument("--encoder-layers", type=int, help="with pixels (default: 40; 1 on a CPU)")
+    parser.add_argument(
+        "--encoder-layers", type=int, help="layers of the encoder, with --source pixels (default: 40; 1 on a CPU)"
+    )
     parser.add_argument("--frames", type=int, nargs="+", default=[8, 16])
-    parser.add_argument("--batch", nargs="+", default=["1"], help="numbers, or largest: what fits with the last way")
-    parser.add_argument("--cap-gb", type=float, default=0.0, help="memory that may be used, but for timing; 0: all")
+    parser.add_argument(
+        "--batch", nargs="+", default=["1"], help="batch sizes, or largest: the largest that fits with the last variant"
+    )
+    parser.add_argument("--cap-gb", type=float, default=0.0, help="memory limit, except for timing; 0: no limit")
     parser.add_argument("--rollout-steps", type=int, default=2)
     parser.add_argument("--dtype", nargs="+", choices=tuple(PRECISIONS), help="default: bfloat16; CPU: float32")
     parser.add_argument("--checkpointing", nargs="+", choices=("off", "on"), default=["off"])
     parser.add_argument(
-        "--attention", nargs="+", default=["auto"], help="auto, per_step, flex, dense, or auto+graph: a line each"
+        "--attention", nargs="+", default=["auto"], help="auto, per_step, flex, dense, or auto+graph; one row each"
     )
-    parser.add_argument("--compile", action="store_true", help="each way of ours once more with compiled blocks")
-    parser.add_argument("--full", action="store_true", help="the official step that trains every weight, too")
-    parser.add_argument("--profile", action="store_true", help="count waits for the device, and compilations")
+    parser.add_argument(
+        "--compile", action="store_true", help="also measure each variant of this package with compiled blocks"
+    )
+    parser.add_argument("--full", action="store_true", help="also measure the official step with full fine-tuning")
+    parser.add_argument("--profile", action="store_true", help="count device synchronisations and compilations")
     add_options(parser)
     parser.add_argument("--memory-of", help=argparse.SUPPRESS)
     options = settle(parser.parse_args(arguments), QUICK)

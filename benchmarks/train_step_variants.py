@@ -1,4 +1,4 @@
-"""What is timed by `train_step.py`? A training step of ours as it is, and the official one, on the same weights."""
+"""The training steps that `train_step.py` times: this package's and the official one, with the same weights."""
 
 from __future__ import annotations
 

@@ -25,11 +25,11 @@ ENCODERS = [one for one in PUBLISHED if one.model_kind == "encoder"]
     [
         ("index", "--shards 2 --in-flight 4 --latency-ms 1", "a hash's"),
         ("loader", "--clips 4", "index of 2,000 episodes"),
-        ("planning", "--quick --no-memory --official {none} --profile", "official: skipped, for there is no"),
+        ("planning", "--quick --no-memory --official {none} --profile", "official: skipped, needs "),
         (
             "train_step",
             "--quick --no-memory --official {none} --source cache pixels --attention per_step --profile --json {json}",
-            "official: skipped, for there is no",
+            "official: skipped, needs ",
         ),
     ],
 )
