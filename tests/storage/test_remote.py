@@ -112,7 +112,7 @@ def test_ranges_are_read_concurrently_and_returned_in_order(gcs: Gcs, file: str)
 
 
 def test_long_read_is_split_into_pieces(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vjepa2_ac.storage.remote._PIECE_BYTES", 1000)
+    monkeypatch.setattr("vjepa2_ac.storage.remote._PART_BYTES", 1000)
     assert storage.read_bytes(file) == DATA
     assert len(gcs.reads()) == -(-len(DATA) // 1000)
     assert storage.read_ranges(file, [(5, 2500), (7, 3)]) == [DATA[5:2505], DATA[7:10]]

@@ -55,7 +55,7 @@ def test_upload_survives_temporary_failures(bucket: Gcs, tmp_path: Path, size: i
 def test_failure_between_pieces_leaves_nothing_and_restarts_the_upload(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(remote, "_PIECE_BYTES", 2 << 20)
+    monkeypatch.setattr(remote, "_PART_BYTES", 2 << 20)
     source = source_of(tmp_path, LARGE)
     begun = []
     answer = Gcs._failure_of

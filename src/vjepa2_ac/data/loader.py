@@ -95,14 +95,14 @@ def training_loader(
     `data.broken_episodes` is skip, clips that cannot be read are missing from their micro-batch, which may be empty;
     no other clip replaces them.
 
-    With a second data set, each data set has a separate sequence. Clip p of the run is clip floor(p * share) of the
-    second data set if floor((p + 1) * share) is larger than floor(p * share). So the share is exact in every part of
-    the run, up to one clip.
+    With a second data set, each data set has a separate sequence. With the fraction f = `MixedDataset.share`, clip p of
+    the run is clip floor(p * f) of the second data set if floor((p + 1) * f) is larger than floor(p * f). The fraction
+    is therefore exact, up to one clip, in every part of the run.
 
     Pinned batches are in page-locked memory, from which copies to a CUDA device do not block the host.
 
     Raises:
-        InputError: There are no training clips, or a clip cannot be read, also in a worker.
+        InputError: There are no training clips, or a clip cannot be read, here or in a worker.
     """
     mixed = dataset if isinstance(dataset, MixedDataset) else MixedDataset(dataset)
     dataset, replayed = mixed.dataset, mixed.replayed
@@ -110,8 +110,8 @@ def training_loader(
     if replayed is not None:
         clips = replace(clips, replayed=_training_clips(replayed, seed), share=Fraction(str(mixed.share)))
     firsts = first_positions(share, batch_size, start=start_position)
-    rows = (list(range(first, first + batch_size)) for first in firsts)
-    micro_batches = map_in_workers(clips, rows, dataset.config.workers, pinned=pinned)
+    positions = (list(range(first, first + batch_size)) for first in firsts)
+    micro_batches = map_in_workers(clips, positions, dataset.config.workers, pinned=pinned)
     return Batches(micro_batches, dataset.broken, replayed.broken if replayed else None)
 
 
@@ -167,10 +167,10 @@ def read_batches(
         InputError: A clip cannot be read; or all clips were skipped and `allow_empty` is False.
     """
     count, is_empty = len(windows), True
-    rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
+    positions = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
     workers = dataset.config.workers if count >= MIN_CLIPS_FOR_WORKERS else 0
     clips = _MicroBatches(dataset, partial(_window_request, dataset, windows))
-    for batch in Batches(map_in_workers(clips, iter(rows), workers), dataset.broken):
+    for batch in Batches(map_in_workers(clips, iter(positions), workers), dataset.broken):
         if batch.starts:
             is_empty = False
             yield batch
@@ -237,26 +237,26 @@ class Batches(Iterator[Batch]):
     """The batches of a loader, in order; errors and skipped clips are reported when their batch is requested.
 
     Args:
-        rows: The results of the workers: micro-batches or errors.
+        results: The results of the workers: micro-batches or errors.
         broken: Records clips that could not be read.
         replayed: Records clips of the second data set that could not be read.
     """
 
     def __init__(
         self,
-        rows: Generator[Batch | UserError, None, None],
+        results: Generator[Batch | UserError, None, None],
         broken: BrokenEpisodes,
         replayed: BrokenEpisodes | None = None,
     ) -> None:
-        self._rows, self._broken, self._replayed = rows, broken, replayed
+        self._results, self._broken, self._replayed = results, broken, replayed
 
     def __next__(self) -> Batch:
         """Return the next batch.
 
         Raises:
-            InputError: A clip cannot be read, also in a worker; or too many episodes are broken.
+            InputError: A clip cannot be read, here or in a worker; or too many episodes are broken.
         """
-        row = next(self._rows)
+        row = next(self._results)
         if isinstance(row, UserError):
             self.close()
             raise row
@@ -267,7 +267,7 @@ class Batches(Iterator[Batch]):
 
     def close(self) -> None:
         """End the workers."""
-        self._rows.close()
+        self._results.close()
 
 
 # ---- worker processes ----
@@ -359,7 +359,7 @@ def _start_servers() -> None:
     its workers to finish the step and then ends them.
     """
     stop = {signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP}
-    for start in (resource_tracker.ensure_running, forkserver.ensure_running):  # the first call clears the mask
+    for start in (resource_tracker.ensure_running, forkserver.ensure_running):  # the first one unblocks the signals
         before = signal.pthread_sigmask(signal.SIG_BLOCK, stop)
         try:
             with safe_imports():
@@ -374,8 +374,9 @@ def _start_servers() -> None:
 def _prepare_worker(_worker: int) -> None:
     """Make this worker exit when its run has ended for any reason, or when a batch cannot be sent.
 
-    PyTorch's watchdog checks the fork server, which lives as long as its workers, so both would stay forever. The
-    thread that sends batches only prints its errors, so the run would wait for the batch forever.
+    PyTorch's watchdog ends a worker when its parent ends. The parent is the fork server, which itself waits for the
+    workers, so neither would exit after the run. The thread that sends batches only prints its errors, so the run would
+    wait for the batch forever.
     """
     queues.Queue._on_queue_feeder_error = staticmethod(_end_without_sending)  # type: ignore[attr-defined]  # untyped
     run = multiprocessing.parent_process()

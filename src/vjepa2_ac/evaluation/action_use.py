@@ -1,4 +1,7 @@
-"""Action use: action-ranking error and energy landscapes, to measure whether the model distinguishes actions."""
+"""Action use: action-ranking error and energy landscapes, to measure whether the model distinguishes actions.
+
+An action is a change of the pose, or a vector: any other list of numbers, without position and rotation.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ _AXES = slice(0, 3)  # components of an action that span the grid; the position 
 
 @dataclass(frozen=True)
 class RolloutStart:
-    """A frame of a held-out clip, the action, and the true frame after it: the start of a one-step prediction."""
+    """One prediction to evaluate: a frame of a held-out clip, an action, and the true frame after this action."""
 
     episode_id: str
     first_step: int  # control step at which the clip begins
@@ -146,7 +149,7 @@ def evaluate_actions(
 def _predict(
     model: Predictor, start: RolloutStart, actions: Float[Tensor, "samples action_dim"]
 ) -> Float[Tensor, "samples tokens dim"]:
-    """Return the predictions in float32. No keys are shared between samples, since the frame attends to its action."""
+    """Return the predictions in float32. Samples cannot share attention keys, since the frame attends to the action."""
     count = len(actions)
     camera = None if start.extrinsics is None else start.extrinsics.expand(count, 1, -1)
     frames = start.frame.expand(count, 1, *start.frame.shape)
@@ -217,12 +220,12 @@ def rank_actions(
         )
         energies = np.reshape(energies_of_alternatives, (2, -1))
         is_same = np.abs(energies - true) <= SAME_ENERGY * max(abs(true), 1e-12)
-        # A prediction that is not finite counts as the farthest: all alternatives are closer than such a true action.
+        # If the prediction for the true action is not finite, all alternatives count as closer.
         is_closer = energies < true if np.isfinite(true) else np.ones_like(energies)
         box, shell = np.where(is_same, 0.5, is_closer).mean(axis=1)
         return box, shell, np.mean(changes[: probes.samples]), energies[0].std(), move.persistence
 
-    in_box, on_shell, change, spread, now = np.array(map_shared(moves, ranked, progress)).T
+    in_box, on_shell, change, spread, persistence = np.array(map_shared(moves, ranked, progress)).T
     ranks = (in_box + on_shell) / 2
     return ActionRanking(
         samples=probes.samples,
@@ -232,8 +235,8 @@ def rank_actions(
         rank=estimate_mean(ranks, ids),
         box=estimate_mean(in_box, ids),
         shell=estimate_mean(on_shell, ids),
-        spread=estimate_ratio(spread, now, ids),
-        change=estimate_ratio(change, now, ids),
+        spread=estimate_ratio(spread, persistence, ids),
+        change=estimate_ratio(change, persistence, ids),
     )
 
 
@@ -256,7 +259,7 @@ def measure_landscapes(
     """
     trues = np.stack([start.true[_AXES] for start in starts])
     nodes, reach = probes.nodes, 0.0 if space.position is None else probes.reach_cm / 100
-    half = max(reach, _MARGIN * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
+    half = max(reach, _MARGIN * float(np.abs(trues).max())) or 1.0  # 1: all true actions are zero
 
     def landscape(start: RolloutStart) -> Landscape:
         true = start.true[_AXES]

@@ -22,13 +22,13 @@ from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import L1, Evaluation
 from vjepa2_ac.evaluation.rows import Row
 from vjepa2_ac.intervals import MIN_EPISODES, Estimate
+from vjepa2_ac.runs.checkpoint import RANKING_TOLERANCE
 from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 
 Conclusion = Literal["yes", "no", "inconclusive", "not measured"]
 
 SAME_ERROR = 0.01  # relative; errors this close count as equal, whatever their interval
-RANKING_TOLERANCE = 0.005  # absolute; action-ranking errors this close count as equal, whatever their interval
-SAME_SUCCESS = 0.1  # absolute; a success rate is not better if its upper bound is less than this above a competitor's
+SAME_SUCCESS = 0.1  # absolute; "no" needs an upper bound less than this above the best competitor's success rate
 CHANCE = 0.5  # action-ranking error of a model that ignores its actions
 _BASE, _PERSISTENCE, _CHANCE = "the base model", "persistence", "chance"  # values of `compared_with`
 _TOO_FEW = "too few for a conclusion"
@@ -67,7 +67,7 @@ class Verdict:
 
     @property
     def interval(self) -> str:
-        """The interval as text, with the digits and the sign of the statement's number; empty without an interval."""
+        """The interval as text, rounded and signed like the number in the statement; empty without an interval."""
         if self.value is None or self.low is None or self.high is None:
             return ""
         if self.unit == "%":
@@ -182,14 +182,14 @@ def summarize(evaluation: Evaluation, rows: Sequence[Row]) -> Summary:
     ranked = () if model.ranking is None else model.ranking.episode_ids
     mapped = () if model.landscapes is None else model.landscapes.episode_ids
     landscape = _landscape(trained_rows, base_rows)
-    ranks_actions = _of_enough(_ranks_actions(trained_rows, base_rows), ranked)
+    ranks_actions = _require_enough_episodes(_ranks_actions(trained_rows, base_rows), ranked)
     summary = Summary(
         subject=evaluation.title,
         measured=f"{counted(len(clips), 'clip')}, {counted(clips.episodes, 'held-out episode')}",
         predicts=_predicts(evaluation, trained_rows, base_rows),
         uses_actions=_uses_actions(trained_rows, ranks_actions),
         ranks_actions=ranks_actions,
-        landscape=None if landscape is None else _of_enough(landscape, mapped),
+        landscape=None if landscape is None else _require_enough_episodes(landscape, mapped),
     )
     return summary if clips.episodes >= MIN_EPISODES else _too_few(summary, clips.episodes)
 
@@ -209,8 +209,8 @@ def _too_few(summary: Summary, episodes: int) -> Summary:
     )
 
 
-def _of_enough(verdict: Verdict, episode_ids: Sequence[str]) -> Verdict:
-    """Return a verdict on clips of these episodes, without a conclusion if there are too few episodes."""
+def _require_enough_episodes(verdict: Verdict, episode_ids: Sequence[str]) -> Verdict:
+    """Return the verdict, without its conclusion if it was measured on too few episodes."""
     episodes = len(set(episode_ids))
     if not 0 < episodes < MIN_EPISODES:
         return verdict
@@ -229,7 +229,7 @@ def _are_too_few(number: int, noun: str) -> str:
 
 def not_measured_verdict(name: str, how: str) -> Verdict:
     """Return a verdict "not measured", with the command that measures it."""
-    return Verdict(name, "not measured", f"measured by {how}")
+    return Verdict(name, "not measured", f"to measure it, run {how}")
 
 
 def with_closed_loop(summary: Summary, run: Path, checkpoint: str) -> Summary:
@@ -249,14 +249,14 @@ def format_percent(share: float) -> str:
 
 
 def format_interval(share: Estimate) -> str:
-    """Return the interval of a share in percent, without the share's sign; empty without an interval."""
+    """Return the interval of a share in percent; of a negative share, that of its absolute value. Empty without one."""
     form = "z.0f" if abs(share.value) >= 0.0995 else "z.1f"
     low, high = (share.low, share.high) if share.value >= 0 else (-share.high, -share.low)
     return f"[{100 * low:{form}}, {100 * high:{form}}]" if share.has_interval else ""
 
 
 def draw_conclusion(gain: Estimate, same: float) -> Conclusion:
-    """Return yes or no if the interval of a gain is on one side of 0 or within `same` of 0, else inconclusive."""
+    """Return yes if the interval of a gain is above 0, no if it is below 0 or within ±`same`, else inconclusive."""
     if max(abs(gain.low), abs(gain.high)) < same:
         return "no"
     conclusions: dict[int, Conclusion] = {-1: "no", 0: "inconclusive", 1: "yes"}
@@ -322,14 +322,15 @@ def _amount(change: Estimate, positive: str, negative: str) -> str:
 
 def _uses_actions(rows: Mapping[str, Row], ranks_actions: Verdict) -> Verdict:
     """Conclude from the one-step error with shuffled actions; yes also requires action ranking better than chance."""
-    cost, gap = (rows[f"{name}.shuffled"].estimate for name in ("cost_of_actions", "gap_of_actions"))
+    # The increase of the error is stated relative to the error with true actions, and judged relative to persistence.
+    increase, gap = (rows[f"{name}.shuffled"].estimate for name in ("cost_of_actions", "gap_of_actions"))
     conclusion, reference, compared_with = draw_conclusion(gap, SAME_ERROR), "", "shuffled actions"
     low, high = ranks_actions.low, ranks_actions.high
     if conclusion == "yes" and low is not None and high is not None and high >= CHANCE:
         conclusion, compared_with = "no" if low > CHANCE else "inconclusive", _CHANCE
         reference = f"(but {ranks_actions.statement} {ranks_actions.interval}, chance 50 %)"
-    statement = f"one-step error {_amount(cost, 'higher', 'lower')} with shuffled actions"
-    return replace(_verdict(SENSITIVITY, conclusion, statement, cost, compared_with), reference=reference)
+    statement = f"one-step error {_amount(increase, 'higher', 'lower')} with shuffled actions"
+    return replace(_verdict(SENSITIVITY, conclusion, statement, increase, compared_with), reference=reference)
 
 
 def _ranks_actions(rows: Mapping[str, Row], base_rows: Mapping[str, Row]) -> Verdict:

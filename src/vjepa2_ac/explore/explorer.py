@@ -30,7 +30,7 @@ from vjepa2_ac.evaluation.evaluate_run import LoadedModels
 from vjepa2_ac.model.predictor import KeyValueCache
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.energy import EnergySlice, Goal, Scene, WorldModelCost, compute_energy_slices, distance
-from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, raise_if_cancelled
+from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, make_cancellation_check
 from vjepa2_ac.planning.search_space import SearchSpace, make_search_space
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces, clip_gripper_changes, integrate_states
@@ -406,7 +406,7 @@ class Search:
         """
         center_action = torch.tensor([list(action)], dtype=torch.float32)
         with self._open_cost(model_index, position, goal) as cost:
-            checked_progress = raise_if_cancelled(cancelled, progress)
+            checked_progress = make_cancellation_check(cancelled, progress)
             return compute_energy_slices(
                 cost, center_action, self.make_search_space(), self.axes, nodes=_GRID_POINTS, progress=checked_progress
             )

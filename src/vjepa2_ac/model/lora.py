@@ -45,9 +45,11 @@ class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no typ
 
     PEFT casts tokens to the adapter's float32 and autocast casts them back; dropout, scaling and addition are separate
     passes, and so are their gradients. Here only the two small matrices are cast, and the matrix products include
-    scaling and addition. In float32 the result is the same up to rounding; in bfloat16 it is rounded less often. PEFT
-    computes everything except plain LoRA on a frozen layer: DoRA, a disabled or merged adapter, data types that do not
-    match. Hooks on the inner layer and matrices are not called, and there are no second derivatives.
+    scaling and addition. In float32 the result is the same up to rounding; in bfloat16 it is rounded less often.
+
+    This class computes plain LoRA on a frozen layer only. PEFT computes all other cases: DoRA, a disabled or merged
+    adapter, and data types that do not match. Hooks on the inner layer and matrices are not called, and there are no
+    second derivatives.
     """
 
     def forward(self, tokens: Float[Tensor, "*batch inputs"], *args: Any, **kwargs: Any) -> Tensor:
@@ -68,7 +70,7 @@ class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no typ
         return self.lora_A[names[0]].weight, self.lora_B[names[0]].weight
 
     def _dtype_of_plain_lora(self, tokens: Tensor) -> torch.dtype | None:
-        """Return the data type of the computation; None if PEFT computes."""
+        """Return the data type of the computation; None if PEFT's `forward` must be used."""
         adapters, layer = self.active_adapters, self.base_layer
         if self.disable_adapters or self.merged or len(adapters) != 1 or adapters[0] not in self.lora_A:
             return None
@@ -183,7 +185,7 @@ def require_adaptation(model: WorldModel) -> Adaptation:
 
 
 def train_all_weights(model: WorldModel) -> None:
-    """Make every weight of the predictor trainable, except in layers without an input."""
+    """Make every weight of the predictor trainable, except in layers that its sizes do not use."""
     start = {name: value.detach().to("cpu", copy=True) for name, value in model.predictor.state_dict().items()}
     model.adaptation = Adaptation("none", model.predictor_fingerprint(), model.encoder_fingerprint(), start)
     model.predictor.float()
@@ -264,7 +266,7 @@ def set_trainable(model: WorldModel, trainable: bool) -> None:
 
 
 def _iterate_trained_weights(model: WorldModel) -> Iterator[nn.Parameter]:
-    """Yield the trained weights: an adapter and whole layers, or all weights of the predictor that have an input."""
+    """Yield the trained weights: an adapter and whole layers, or all weights of the predictor in used layers."""
     lora = isinstance(model.predictor, PeftModel)
     for name, value in model.predictor.named_parameters():
         if _is_trained_name(name) if lora else name.split(".", 1)[0] not in model.base_predictor.unused_layers:

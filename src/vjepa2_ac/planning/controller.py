@@ -30,7 +30,7 @@ from vjepa2_ac.planning.cameras import Cameras, Fault
 from vjepa2_ac.planning.energy import Axes, ChunkScores, EnergyFunction, Goal, Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, make_timed_goals, require_goal_ends
 from vjepa2_ac.planning.model_setup import prepare_for_planning
-from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, raise_if_cancelled
+from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, make_cancellation_check
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_within_limits, make_search_space
 from vjepa2_ac.planning.settings import read_axes, require_base_frame, resolve_data_limits, warn_if_limits_exceed_data
 from vjepa2_ac.planning.solvers import PlanStart
@@ -38,7 +38,7 @@ from vjepa2_ac.registry import PLANNING_FILES
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces, integrate_changes
 
-_PRIOR_STEPS = 3  # model steps left for the prior's input if a goal has no `at_most`; fewer give larger motions
+_PRIOR_STEPS = 3  # remaining model steps as the prior's input if a goal has no `at_most`; fewer lead to larger motions
 State = Float[np.ndarray, " numbers"]
 Latents = Float[Tensor, "tokens dim"]
 Reason = Literal["planned", "out of time", "at the goal", "no finite energy", "outside the workspace", Fault]
@@ -81,8 +81,8 @@ class Decision:
 class Controller:
     """Plans towards a goal, one model step at a time, and stores what was observed.
 
-    The same seed, images and states give the same actions: the n-th decision after a reset (from 0) is drawn with
-    seed + n. Actions are within `planning.limits`, for any output of the model.
+    The same seed, images and states give the same actions: decision n after a reset (counted from 0) uses the
+    random seed `seed + n`. Actions are within `planning.limits`, for any output of the model.
 
     Example:
         >>> controller = Controller(load_model("builtin:sim-tiny"))  # of a run: Controller.of_run(load_run(FOLDER))
@@ -136,7 +136,7 @@ class Controller:
         self.decision: Decision | None = None  # the latest decision
 
     def _load_files(self, world_model: WorldModel) -> None:
-        """Read axes, monitor and prior, and check that they were made for this model: its weights are hashed once."""
+        """Read the calibrated axes, the monitor and the prior, and check that each was made for this model."""
         config, self._axes = self.config, None
         self._compare: Compare | None = None
         self._prior_start: PriorStart | None = None
@@ -237,8 +237,9 @@ class Controller:
 
         Raises:
             SearchCancelledError: `cancelled` returned true; the previous goals still apply.
-            InputError: An image is invalid, sizes differ, the mask is empty, a goal has no end, the last goal has a
-                bound, or a gripper mode is set for a robot whose states are vectors, or leaves no free component.
+            InputError: An image is invalid, sizes differ, or the mask is empty. A goal other than the last has neither
+                `at_most` nor `share`, or the last goal has `at_most`. A gripper mode is set although the states are
+                vectors, or no component of the action remains free.
             ValueError: No goals.
         """
         if not goals:
@@ -250,9 +251,9 @@ class Controller:
         search_spaces = {goal.gripper: self._make_search_space(goal.gripper) for goal in goals} | {
             None: self._search_spaces[None]
         }
-        report, latents = raise_if_cancelled(cancelled), []
+        check, latents = make_cancellation_check(cancelled), []
         for index, goal in enumerate(goals):
-            report(index, len(goals))
+            check(index, len(goals))
             latents.append(self.encode(goal.image))
         weights = self.cameras.compute_patch_weights(mask, goals[0].image)
         self._goals, self._goal_latents, self._patch_weights = tuple(goals), torch.stack(latents), weights
@@ -335,7 +336,7 @@ class Controller:
         progress = self._update_progress(latents)
         current_energies, _ = self._compute_current_energies(latents, progress, chunks.shape[1])
         cost = self._make_cost(latents, state, progress)
-        cost.progress = raise_if_cancelled(cancelled)
+        cost.progress = make_cancellation_check(cancelled)
         energies = cost(torch.from_numpy(np.concatenate([np.zeros_like(chunks[:1]), chunks])).float()).double()
         return ChunkScores(
             energies[1:].numpy(), float(energies[0]), self._combine_steps(current_energies), progress.goal_index
@@ -389,19 +390,21 @@ class Controller:
     def _compute_current_energies(
         self, latents: Latents, progress: GoalProgress, steps: int
     ) -> tuple[Float[Tensor, " steps"], tuple[int, ...]]:
-        """Return the distance of the current image from the goal of each of the next steps, and the goals' indices."""
-        goal, done = self._get_goal(progress.goal_index), self._num_decisions - progress.start_step
-        goal_latents = goal.get_latents(done, steps)
+        """Return the energy of the current image towards the goal of each of the next steps, and the goals' indices."""
+        goal, elapsed_steps = self._get_goal(progress.goal_index), self._num_decisions - progress.start_step
+        goal_latents = goal.get_latents(elapsed_steps, steps)
         current_energies = distance(latents.expand_as(goal_latents), goal_latents, self._energy, goal.weights)
-        return current_energies, tuple(progress.goal_index + goal.get_index(done + step) for step in range(steps))
+        return current_energies, tuple(
+            progress.goal_index + goal.get_index(elapsed_steps + step) for step in range(steps)
+        )
 
     def _make_cost(self, latents: Latents, state: State, progress: GoalProgress) -> WorldModelCost:
-        goal, done = self._get_goal(progress.goal_index), self._num_decisions - progress.start_step
+        goal, elapsed_steps = self._get_goal(progress.goal_index), self._num_decisions - progress.start_step
         scene = Scene(latents, torch.from_numpy(state).float(), self._camera_pose, self._axes, self.config.views)
-        return WorldModelCost(self._model, scene, goal, self._energy, done=done, spaces=self.spaces)
+        return WorldModelCost(self._model, scene, goal, self._energy, done=elapsed_steps, spaces=self.spaces)
 
-    def _combine_steps(self, distances: Float[Tensor, " steps"]) -> float:
-        return float(distances[-1] if self.config.energy.steps == "last" else distances.sum())
+    def _combine_steps(self, energies: Float[Tensor, " steps"]) -> float:
+        return float(energies[-1] if self.config.energy.steps == "last" else energies.sum())
 
     def _decide(self, latents: Latents, state: State, samples: np.ndarray | None, cancelled: Cancelled) -> Decision:
         """Return the decision at a usable frame: a plan, or a zero action if no motion is needed or possible."""
@@ -509,7 +512,8 @@ def _require_camera_pose(model: WorldModel, extrinsics: np.ndarray | None, views
     if extrinsics is not None:
         EXTRINSICS.require_state(extrinsics, "extrinsics")
     if (uses := model.sizes.predictor.use_extrinsics) != (extrinsics is not None):
-        problem, needed = f"{uses}, camera pose given: {not uses}", "a camera pose if and only if the model uses it"
+        problem = f"{uses}, but {'no' if uses else 'a'} camera pose was given"
+        needed = "a camera pose if and only if the model uses it"
         raise InputError(where="model: predictor.use_extrinsics", found=problem, needed=needed)
     if uses and views > 1:
         raise InputError(
@@ -519,7 +523,9 @@ def _require_camera_pose(model: WorldModel, extrinsics: np.ndarray | None, views
 
 def _require_spaces(model: WorldModel, spaces: Spaces) -> None:
     if find_heads_to_replace(model.sizes, spaces.widths):
-        needed = f"{spaces.widths.state} and {spaces.widths.action}, as the spaces of the data that it was trained on"
+        needed = (
+            f"states of {spaces.widths.state} and actions of {spaces.widths.action} numbers, as in its training data"
+        )
         raise InputError(where="model", found=describe_model_widths(model.sizes), needed=needed)
     if spaces.action.follows == "unknown":
         problem = "recorded actions whose effect on the state is unknown"

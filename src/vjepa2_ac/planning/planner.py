@@ -48,7 +48,7 @@ class Cost(Protocol):
         ...
 
 
-def raise_if_cancelled(cancelled: Cancelled, progress: Progress = no_progress) -> Progress:
+def make_cancellation_check(cancelled: Cancelled, progress: Progress = no_progress) -> Progress:
     """Return a progress callback that raises `SearchCancelledError` in its caller once `cancelled` returns true."""
 
     def report(done: int, total: int) -> None:
@@ -215,7 +215,7 @@ class Planner:
             if cancelled():
                 raise SearchCancelledError
             done, share = sum(shares[: len(record)]), shares[len(record)]
-            report = raise_if_cancelled(cancelled, self.progress)
+            report = make_cancellation_check(cancelled, self.progress)
             with report_progress(cost, report, done=done, share=share, total=total):
                 record.append(self._run_iteration(search, cost, space))
         stopped: Stopped = "finished" if len(record) == len(shares) else "out of time"

@@ -44,7 +44,7 @@ _NEEDED = "the state of a run, as written by vjepa2-ac"
 _FIX = "Delete this checkpoint to use an older one"
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
-RANKING_TOLERANCE = 0.005  # smaller differences of the action-ranking error are ignored: other clips change it by more
+RANKING_TOLERANCE = 0.005  # absolute; smaller differences in action-ranking error count as equal
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -81,7 +81,7 @@ class RunState:
     best_ranking_error: Finite | None = None  # action-ranking error of the best validation, with keep_best=ranking
     lowest_ranking_error: Finite | None = None  # lowest action-ranking error of all validations
     base_ranking_error: Finite | None = None  # action-ranking error before the first step, with keep_best=ranking
-    validation_settings: Mapping[str, str] | None = None  # which determine its errors, see `training.resume`
+    validation_settings: Mapping[str, str] | None = None  # settings that its errors depend on; see `training.resume`
     loss_scale: Mapping[str, int | float] | None = None  # state of the gradient scaler, with fp16
     data: tuple[DataState, ...] = ()  # the data set and, if configured, the replay data set
 
@@ -94,10 +94,9 @@ class RunState:
         """Return the state after a validation at the current step, which becomes the best one if it is better.
 
         Args:
-            error: The rollout error. It decides if `ranking_error` is None, and among validations whose action-ranking
-                error is within `RANKING_TOLERANCE` of the lowest.
-            ranking_error: The action-ranking error. That of the best validation is within `RANKING_TOLERANCE` of the
-                lowest.
+            error: The rollout error. Without `ranking_error` the validation with the lowest rollout error is the best.
+            ranking_error: The action-ranking error. Only validations within `RANKING_TOLERANCE` of the lowest one are
+                candidates; among them, the one with the lowest rollout error is the best.
         """
         if not math.isfinite(error) or (ranking_error is not None and not math.isfinite(ranking_error)):
             return self
@@ -346,7 +345,7 @@ def read_torch(path: Path) -> Any:
 
 
 def _require_as_written(path: Path) -> None:
-    """Refuse other formats than uncompressed zip archives, because loading a small file of these may need any memory.
+    """Refuse all formats but uncompressed zip archives: a small file of another format can need unlimited memory.
 
     Raises:
         OSError: The file cannot be read.
@@ -411,7 +410,7 @@ def select_checkpoint(run: Path, selection: str = SELECTED) -> SelectedCheckpoin
     path = folder / checkpoint_name(step or 0)
     problem: str | None
     if step is None:
-        causes = "no validation yet, a changed validation, checkpoint.keep_best was off, or it was deleted"
+        causes = "there was no validation, its settings were changed, checkpoint.keep_best was off, or it was deleted"
         problem = f"no best checkpoint ({causes})" if is_best else f"--checkpoint {selection}"
     elif not path.is_dir():
         problem = f"no checkpoint of step {step:,}"

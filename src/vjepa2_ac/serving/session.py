@@ -52,7 +52,7 @@ class SessionOptions:
     image_keys: tuple[str, ...] = IMAGE_KEYS
     deadline_s: float = 60.0  # for a decision, including the encoding of its goal; afterwards the action is zero
     dry_run: bool = False  # whether to plan but send the zero action
-    is_blind: bool = False  # whether the model ranks actions no better than chance; then no best chunk is returned
+    is_blind: bool = False  # whether the model ranks actions at chance level; scores then name no best chunk
 
 
 @dataclass
@@ -231,7 +231,9 @@ class Session:
         return replace(decision, plan=None, states=None), f"not sent: {reason}"
 
     def _format_decision(self, decision: Decision | None, state: np.ndarray, why: str) -> dict[str, Any]:
-        """Return the reply for a decision. Only arrays with one row per action are arrays, because clients slice these.
+        """Return the reply for a decision.
+
+        Only values with one row per action are arrays, because clients take one row of every array.
 
         Without a decision, or without a plan in it, the action is zero.
         """
@@ -267,7 +269,7 @@ class Session:
         """Convert the changes of the plan into the format of the reply.
 
         With `actions="pose"` these are waypoints to the first target. Otherwise they are one row per model step: target
-        states if the data's actions follow the target, else changes.
+        states if the recorded actions are absolute targets, else changes.
         """
         if self.options.actions == "pose":
             return interpolate_waypoints(state, changes[0], self.options.control_steps)

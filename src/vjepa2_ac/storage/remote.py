@@ -21,8 +21,8 @@ from vjepa2_ac.storage import retries
 _T = TypeVar("_T")
 
 _THREADS = 64  # concurrent reads of `read_ranges` in a process
-_PIECE_BYTES = 16 << 20  # longer reads are split, so that each piece has the full time-out
-_MIN_BYTES_PER_S = 1 << 20  # a write may take this long per byte in addition to the usual time-out
+_PART_BYTES = 16 << 20  # longer reads are split into parts, each with the full time-out
+_MIN_BYTES_PER_S = 1 << 20  # a write gets its size divided by this speed, in addition to the usual time-out
 _VERSION_KEYS = ("generation", "etag", "ETag", "blob_id", "mtime", "last_modified", "LastModified", "created")
 
 _LOGIN_COMMANDS = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
@@ -137,7 +137,7 @@ def upload(source: Path, url: str) -> None:
     filesystem = _filesystem(url, writing=True)
     names = (str(source), filesystem._strip_protocol(url))
     # Small pieces, because fsspec's event loop is blocked while a piece is read from the disk.
-    pieces = {"chunksize": _PIECE_BYTES} if _protocol(url) == "gs" else {}
+    pieces = {"chunksize": _PART_BYTES} if _protocol(url) == "gs" else {}
     allowed_s = retries.DEFAULT.timeout_s + source.stat().st_size / _MIN_BYTES_PER_S
     _retry(
         url,
@@ -165,9 +165,9 @@ def read_range(url: str, start: int, length: int) -> bytes:
         InputError: The file is a git-lfs pointer.
         UnreachableError: The URL cannot be reached.
     """
-    if length > _PIECE_BYTES:
-        cuts = range(start, start + length, _PIECE_BYTES)
-        return b"".join(_concurrently(url, [(cut, min(_PIECE_BYTES, start + length - cut)) for cut in cuts]))
+    if length > _PART_BYTES:
+        cuts = range(start, start + length, _PART_BYTES)
+        return b"".join(_concurrently(url, [(cut, min(_PART_BYTES, start + length - cut)) for cut in cuts]))
     data = _retry(url, lambda timeout_s: _read_once(url, start, length, timeout_s)) if length > 0 else b""
     if start == 0:
         refuse_pointer(url, data)
@@ -175,10 +175,10 @@ def read_range(url: str, start: int, length: int) -> bytes:
 
 
 def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-    """Return several (start, length) pieces of a file, each complete; they are fetched concurrently.
+    """Return several (start, length) ranges of a file, each complete; they are fetched concurrently.
 
     Raises:
-        OSError: There is no such file, or it ends within a piece.
+        OSError: There is no such file, or it ends within a range.
         UnreachableError: The URL cannot be reached.
     """
     pieces = _concurrently(url, ranges)
@@ -189,12 +189,12 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
 
 
 def read_adjacent_ranges(url: str, ranges: Sequence[tuple[int, int]], gap_bytes: int = 0) -> list[bytes]:
-    """Return several (start, length) pieces like `read_ranges`, fetching neighbouring pieces in one request.
+    """Return several (start, length) ranges like `read_ranges`, fetching neighbouring ranges in one request.
 
     Args:
         url: The file.
         ranges: (start, length) ranges, ascending.
-        gap_bytes: Pieces at most this far apart are fetched together with the gap between them.
+        gap_bytes: Ranges at most this far apart are fetched together with the gap between them.
     """
     runs: list[list[tuple[int, int]]] = []
     for start, length in ranges:
@@ -208,9 +208,9 @@ def read_adjacent_ranges(url: str, ranges: Sequence[tuple[int, int]], gap_bytes:
 
 
 def _concurrently(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-    if len(ranges) < 2 or any(length > _PIECE_BYTES for _, length in ranges):
+    if len(ranges) < 2 or any(length > _PART_BYTES for _, length in ranges):
         return [read_range(url, start, length) for start, length in ranges]
-    return list(_threads(os.getpid()).map(lambda piece: read_range(url, *piece), ranges))
+    return list(_threads(os.getpid()).map(lambda bounds: read_range(url, *bounds), ranges))
 
 
 def bytes_fetched() -> int:
@@ -222,7 +222,7 @@ _fetched, _counting = [0], threading.Lock()
 
 
 @lru_cache(maxsize=1)
-def _threads(process: int) -> ThreadPoolExecutor:  # noqa: ARG001 - threads do not survive a fork
+def _threads(process: int) -> ThreadPoolExecutor:  # noqa: ARG001 - a cache key: a forked process needs new threads
     return ThreadPoolExecutor(_THREADS, thread_name_prefix="remote")
 
 

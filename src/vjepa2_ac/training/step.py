@@ -33,7 +33,7 @@ from vjepa2_ac.training.optim import learning_rate_at, trained_parameters
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # (predicted latents, true latents) -> the loss of each element
 
-SMALLEST_LOSS_SCALE = 1.0  # fp16: if gradients still overflow, they are not finite for another reason
+SMALLEST_LOSS_SCALE = 1.0  # fp16: gradients that are not finite at a smaller scale are an error, not an overflow
 
 
 @dataclass
@@ -151,15 +151,15 @@ def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
     """Accumulate and clip the gradients of the next micro-batches of all processes; the weights are unchanged.
 
     Loss and gradient are means over the clips of the step. If clips are skipped (`data.broken_episodes=skip`), they
-    are means over the remaining clips. All clips have the same weight, also if micro-batches differ in size.
+    are means over the remaining clips. All clips have the same weight, even if micro-batches differ in size.
 
     Args:
         run: The run.
         batches: Source of micro-batches.
 
     Raises:
-        InputError: A loss or gradient is not finite; names the clips of this process. Or a clip of any process cannot
-            be read, or all processes together have too many broken episodes; then all processes raise an error.
+        InputError: A loss or gradient is not finite; the message names the clips of this process. A process cannot read
+            a clip, or all processes together have too many broken episodes; in these two cases all raise an error.
     """
     if not run.world_model.training:  # after a validation
         run.world_model.train()
@@ -300,8 +300,8 @@ def _share_broken_episodes(run: Run) -> None:
 
 
 def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str]) -> None:
-    overflow = run.scaler.is_enabled() and run.scaler.get_scale() >= SMALLEST_LOSS_SCALE
-    if math.isfinite(loss) and (math.isfinite(norm) or overflow):
+    may_be_overflow = run.scaler.is_enabled() and run.scaler.get_scale() >= SMALLEST_LOSS_SCALE
+    if math.isfinite(loss) and (math.isfinite(norm) or may_be_overflow):
         return
     fp16 = ", or set training.precision to bf16 or fp32" if run.scaler.is_enabled() else ""
     problem = f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}"
