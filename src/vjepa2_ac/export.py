@@ -158,7 +158,7 @@ def _card(run: Subject, checkpoint: Path, folder: Path, metrics: Metrics | None)
         measured=measured,
         plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
         base=model.adaptation,
-        heads=None if model.new_input_heads is None else get_model_widths(model.sizes),
+        new_widths=None if model.new_input_projections is None else get_model_widths(model.sizes),
         takes=describe_model_widths(model.sizes),
         steps=read_state(checkpoint).step,
         trained=trainable_report(model),

@@ -148,7 +148,7 @@ def test_small_data_set_gets_fewer_steps_and_larger_held_out_shares() -> None:
     assert plain_values(small.config_values)["validation"]["every"] == 60
 
 
-def test_vector_states_train_new_input_heads() -> None:
+def test_vector_states_train_new_input_projections() -> None:
     config = make(replace(PROPERTIES, states="vector", idle=None)).config
     assert config.adapter.modules_to_save == ("state_encoder", "action_encoder")
 

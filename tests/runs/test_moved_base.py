@@ -167,7 +167,7 @@ def base_run(make_config: MakeConfig) -> Path:
         ),
         (
             {"adapter__modules_to_save": ["action_encoder", "state_encoder"]}, {"widths": Widths(9, 9)}, "selected",
-            SELECTED.replace("base model", "base model with untrained input heads"),
+            SELECTED.replace("base model", "base model with untrained input projections"),
         ),
         (
             {"adapter__peft": {"init_lora_weights": False}}, {}, "selected",

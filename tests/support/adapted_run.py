@@ -10,7 +10,7 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.model.adapter_folder import save_trained
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.lora import add_adapter
-from vjepa2_ac.model.world_model import fit_heads
+from vjepa2_ac.model.world_model import replace_input_projections
 from vjepa2_ac.runs.checkpoint import ADAPTER, RunState, write_checkpoint
 from vjepa2_ac.runs.folder import CONFIG
 
@@ -25,7 +25,7 @@ def write_adapted_run(
     (folder / CONFIG).write_text(config_as_yaml(config))
     model = load_base(config.model, seed=config.seed)
     if widths is not None:
-        fit_heads(model, widths, seed=1)
+        replace_input_projections(model, widths, seed=1)
     add_adapter(model, config.adapter, seed=0)
     generator = torch.Generator().manual_seed(2)
     for step in steps:

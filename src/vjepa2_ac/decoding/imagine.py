@@ -297,7 +297,7 @@ class ValidationStrip:
             return DecodedRollout(name, AS_RECORDED, actions, decode_views(decoder, predicted))
 
         rollouts, adaptation = [predict("model now")], world_model.adaptation
-        if adaptation is not None and adaptation.kind == "lora" and world_model.new_input_heads is None:
+        if adaptation is not None and adaptation.kind == "lora" and world_model.new_input_projections is None:
             with use_base_weights(world_model):
                 rollouts.insert(0, predict("base"))
         decoded = decode_views(decoder, latents[0])

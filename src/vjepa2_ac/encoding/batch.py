@@ -20,7 +20,7 @@ from vjepa2_ac.data.transforms import Crop, crop_frames, pixels_to_input, split_
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.encoder import ENCODE_CHUNK
-from vjepa2_ac.model.world_model import WorldModel, describe_model_widths, find_heads_to_replace
+from vjepa2_ac.model.world_model import WorldModel, describe_model_widths, find_projections_to_replace
 
 
 @torch.no_grad()
@@ -130,10 +130,10 @@ def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> No
     Raises:
         InputError: The widths differ.
     """
-    if find_heads_to_replace(world_model.sizes, widths):
+    if find_projections_to_replace(world_model.sizes, widths):
         problem = f"data with states of {widths.state} and actions of {widths.action} numbers"
         needed = f"{describe_model_widths(world_model.sizes)}, as this model requires"
-        fix = "Choose other data, or train on this data: `train` replaces the model's input heads"
+        fix = "Choose other data, or train on this data: `train` replaces the model's input projections"
         raise InputError(where=where, found=problem, needed=needed, fix=fix)
 
 

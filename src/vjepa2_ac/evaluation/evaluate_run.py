@@ -95,7 +95,7 @@ def load_models(
     elif BASE in against and not is_of_run:
         base_model = _load_like(name, world_model, config.model.base, config, dataset.widths)
         evaluated_models.append(EvaluatedModel(BASE, "base", base_model))
-    elif BASE in against and world_model.new_input_heads is not None:
+    elif BASE in against and world_model.new_input_projections is not None:
         notes.append(_NO_BASE)
     elif BASE in against:
         evaluated_models.append(EvaluatedModel(BASE, "base", world_model, partial(use_base_weights, world_model)))

@@ -1,6 +1,6 @@
 """Save and load trained weights: an adapter or a predictor, with a card that identifies the base model.
 
-The files are not trusted.
+The files may be untrusted: every value is checked, and no code is executed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from vjepa2_ac.model.lora import (
     train_all_weights,
     wrap_predictor,
 )
-from vjepa2_ac.model.world_model import WorldModel, fit_heads
+from vjepa2_ac.model.world_model import WorldModel, replace_input_projections
 from vjepa2_ac.storage.structured import parse_record, read_json_object
 from vjepa2_ac.storage.tensors import read_tensors, save_tensors
 
@@ -43,8 +43,8 @@ FULL_WEIGHTS = "predictor.safetensors"
 
 
 @dataclass(frozen=True)
-class Heads:
-    """New input layers: the widths of actions and states, and the seed of their initial weights."""
+class ProjectionCard:
+    """New input projections: the widths of actions and states, and the seed of the initial weights."""
 
     action_dim: VectorWidth
     state_dim: VectorWidth
@@ -59,7 +59,7 @@ class Card:
     base_predictor: str
     encoder: str
     encoder_in_words: str  # description for messages; only the fingerprint is compared
-    fresh_heads: Heads | None = None  # None: the input layers are those of the base model
+    fresh_heads: ProjectionCard | None = None  # new input projections; None if they are the base model's
 
 
 def save_trained(model: WorldModel, folder: str | Path) -> None:
@@ -73,10 +73,10 @@ def save_trained(model: WorldModel, folder: str | Path) -> None:
         OSError: The disk is full, or another system error.
         ValueError: The model is not adapted.
     """
-    folder, adaptation, sizes, heads = Path(folder), require_adaptation(model), model.sizes.predictor, None
-    if model.new_input_heads is not None:
-        heads = Heads(sizes.action_dim, sizes.state_dim, model.new_input_heads.seed)
-    card = Card(adaptation.kind, adaptation.base, adaptation.encoder, model.encoder_description, heads)
+    folder, adaptation, sizes, projections = Path(folder), require_adaptation(model), model.sizes.predictor, None
+    if model.new_input_projections is not None:
+        projections = ProjectionCard(sizes.action_dim, sizes.state_dim, model.new_input_projections.seed)
+    card = Card(adaptation.kind, adaptation.base, adaptation.encoder, model.encoder_description, projections)
     folder.mkdir(parents=True, exist_ok=True)
     if card.kind == "lora":
         save_tensors(lora_weights(model), folder / LORA_WEIGHTS)
@@ -88,23 +88,23 @@ def save_trained(model: WorldModel, folder: str | Path) -> None:
 
 
 def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:
-    """Load weights from `save_trained` into a base model, or into a model that already has an adapter.
+    """Load weights that `save_trained` wrote into a base model, or into a model that already has an adapter.
 
     Args:
-        model: The base model, or a model with an adapter of the same config, which is not wrapped again.
+        model: The base model, which gets a new adapter; or a model whose adapter has the same config.
         folder: The folder with the weights.
-        trainable: Whether the weights can be trained; None keeps the state of an existing adapter and freezes a new
-            one.
+        trainable: Whether the weights can be trained. None: an existing adapter keeps its state, a new adapter is
+            frozen.
 
     Raises:
         InputError: The folder contains no trained weights or is damaged; or the weights were trained on another base
-            model, or differ in config from the existing adapter.
+            model, or their config differs from that of the existing adapter.
     """
     folder = Path(folder)
     is_new, card = model.adaptation is None, read_card(folder, model)
-    heads = card.fresh_heads
-    if heads is not None and is_new and model.new_input_heads is None:
-        fit_heads(model, Widths(heads.state_dim, heads.action_dim), heads.seed)
+    projections = card.fresh_heads
+    if projections is not None and is_new and model.new_input_projections is None:
+        replace_input_projections(model, Widths(projections.state_dim, projections.action_dim), projections.seed)
     if card.kind == "lora":
         _load_lora(model, folder)
     else:
@@ -145,18 +145,18 @@ def read_card(folder: Path, model: WorldModel) -> Card:
     card = parse_record(Card, read_json_object(path, needed=needed), where=str(path), needed=needed)
     predictor = model.adaptation.base if model.adaptation else model.predictor_fingerprint()
     encoder = model.adaptation.encoder if model.adaptation else model.encoder_fingerprint()
-    for part, in_model, in_card, model_details, card_details in (
+    for part, model_hash, card_hash, model_details, card_details in (
         ("predictor", predictor, card.base_predictor, "", ""),
         ("encoder", encoder, card.encoder, f": {model.encoder_description}", f": {card.encoder_in_words}"),
     ):
-        if in_model != in_card:
-            trained_on, loaded = f"{in_card[:12]}{card_details}", f"{in_model[:12]}{model_details}"
+        if model_hash != card_hash:
+            trained_on, loaded = f"{card_hash[:12]}{card_details}", f"{model_hash[:12]}{model_details}"
             description = f"an adapter trained on another {part} ({trained_on}) than this model's ({loaded})"
             fix = "Set model.base (or model.encoder) to the model on which it was trained"
             raise InputError(where=str(path), found=description, fix=fix)
     if model.adaptation is not None and model.adaptation.kind != card.kind:
-        description = f"an adapter of kind {card.kind}, and the model has one of kind {model.adaptation.kind}"
-        raise InputError(where=str(folder), found=description, fix="Set adapter.kind to the one it was trained with")
+        description = f"weights of adapter.kind {card.kind}, but the model has adapter.kind {model.adaptation.kind}"
+        raise InputError(where=str(folder), found=description, fix=f"Set adapter.kind: {card.kind}")
     return card
 
 

@@ -1,6 +1,6 @@
 """Add, disable and merge trainable weights: a LoRA adapter on the predictor, or the whole predictor.
 
-`adapter_folder` saves and loads them.
+`adapter_folder` saves and loads the trained weights.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vjepa2_ac.config.model import PEFT_NAMES
 from vjepa2_ac.errors import InputError, quiet_imports
 from vjepa2_ac.model.low_rank import LowRankLayer, low_rank_linear
 from vjepa2_ac.model.predictor import ActionConditionedPredictor
-from vjepa2_ac.model.world_model import Adaptation, WorldModel, base_weights, require_trained_heads
+from vjepa2_ac.model.world_model import Adaptation, WorldModel, base_weights, require_trained_projections
 from vjepa2_ac.storage.structured import parse_record, short_repr
 
 with quiet_imports():
@@ -32,24 +32,24 @@ with quiet_imports():
 _SETS = {"attention": ("q", "k", "v", "o"), "mlp": ("fc1", "fc2")}
 NEEDED = "a LoRA adapter of V-JEPA 2-AC's predictor in PEFT's format, as written by vjepa2-ac"
 FIX = "Copy or train the adapter again; other methods of PEFT are not supported"
-_INFORMATIONAL = frozenset({  # options without effect on the adapter
+_INFORMATIONAL = frozenset({  # options that do not affect the adapter
     "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_type", "peft_version",
     "revision", "task_type",
 })  # fmt: skip
-_LITERAL = re.compile(r"[\w.]+")  # a plain layer name, which is fast to match as a regular expression
-_MOST_RANK, _MOST_ALPHA = 1024, 1e6
+_LITERAL = re.compile(r"[\w.]+")  # a plain layer name, which PEFT matches quickly as a regular expression
+_MAX_RANK, _MAX_ALPHA = 1024, 1e6
 
 
 class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no types
     """PEFT's linear layer with a low-rank adapter, with fewer passes over the tokens for plain LoRA.
 
-    PEFT casts tokens to the adapter's float32 and autocast casts them back; dropout, scaling and addition are separate
-    passes, and so are their gradients. Here only the two small matrices are cast, and the matrix products include
-    scaling and addition. In float32 the result is the same up to rounding; in bfloat16 it is rounded less often.
+    PEFT casts tokens to the adapter's float32, and autocast casts them back. Dropout, scaling, addition and their
+    gradients are separate passes. Here only the two small matrices are cast, and the matrix products include scaling
+    and addition. In float32 the result is the same up to rounding; in bfloat16 it is rounded less often.
 
-    This class computes plain LoRA on a frozen layer only. PEFT computes all other cases: DoRA, a disabled or merged
-    adapter, and data types that do not match. Hooks on the inner layer and matrices are not called, and there are no
-    second derivatives.
+    This class computes only plain LoRA on a frozen layer. PEFT computes all other cases: DoRA, a disabled or merged
+    adapter, and data types that do not match. Hooks on the base layer and the matrices are not called, and second
+    derivatives are not supported.
     """
 
     def forward(self, tokens: Float[Tensor, "*batch inputs"], *args: Any, **kwargs: Any) -> Tensor:
@@ -59,8 +59,8 @@ class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no typ
             return super().forward(tokens, *args, **kwargs)  # type: ignore[no-any-return]
         name = self.active_adapters[0]
         dropout = self.lora_dropout[name]
-        masking = None if isinstance(dropout, nn.Identity) or not self.training else dropout
-        return low_rank_linear(tokens.to(dtype), self.base_layer, self, masking, self.scaling[name])
+        active_dropout = None if isinstance(dropout, nn.Identity) or not self.training else dropout
+        return low_rank_linear(tokens.to(dtype), self.base_layer, self, active_dropout, self.scaling[name])
 
     def matrices(self) -> tuple[Tensor, ...]:
         """Return the two matrices of the active adapter; empty if there are several adapters."""
@@ -80,51 +80,51 @@ class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no typ
             return None
         if torch.is_autocast_enabled(tokens.device.type):
             return torch.get_autocast_dtype(tokens.device.type)
-        same = tokens.dtype == layer.weight.dtype == self.lora_A[adapters[0]].weight.dtype
-        return tokens.dtype if same else None
+        is_same = tokens.dtype == layer.weight.dtype == self.lora_A[adapters[0]].weight.dtype
+        return tokens.dtype if is_same else None
 
 
 class TrainableReport(NamedTuple):
-    """Parameter counts; the parameters of an adapter are counted in `trained` only."""
+    """Numbers of parameters. The parameters of an adapter are counted in `trained` only."""
 
     trained: int
     predictor: int
-    total: int
+    total: int  # predictor and encoder
 
     def __str__(self) -> str:
-        share = f"{self.trained / self.predictor:.2%} of the predictor's {self.predictor:,}"
-        return f"{self.trained:,} parameters are trained ({share}); the model has {self.total:,}"
+        fraction = f"{self.trained / self.predictor:.2%} of the predictor's {self.predictor:,}"
+        return f"{self.trained:,} parameters are trained ({fraction}); the model has {self.total:,}"
 
 
 def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
-    """Add an adapter to the predictor of a model, or train the whole predictor. Trained weights are float32.
+    """Add an adapter to the predictor of a model, or make the whole predictor trainable.
 
-    A new adapter does not change the output, because its second matrix is zero, unless `peft.init_lora_weights` is
-    `false` or `orthogonal`.
+    Trained weights are float32. A new adapter does not change the output, because its second matrices are zero, unless
+    `peft.init_lora_weights` is `false` or `orthogonal`.
 
     Args:
         model: The base model.
         config: The config of the adapter.
-        seed: The seed of the first matrices.
+        seed: The seed of the adapter's initial weights.
 
     Raises:
-        InputError: A target matches no layer, another key does not fit the predictor or PEFT, or a new input layer
-            (`fit_heads`) would not be trained.
+        InputError: A target matches no layer, another key does not fit the predictor or PEFT, or a new input projection
+            (`replace_input_projections`) would not be trained.
         ValueError: The model is already adapted.
     """
     if model.adaptation is not None:
-        raise ValueError("this model has been adapted already: merge_adapter first, or load_trained into it")
+        raise ValueError("this model is already adapted: call merge_adapter first, or load_trained to load weights")
     if config.kind == "none":
         train_all_weights(model)
         return
-    if model.new_input_heads is not None:
-        require_trained_heads(
-            tuple(dict.fromkeys(name.split(".")[0] for name in model.new_input_heads.replaced)), config
+    if model.new_input_projections is not None:
+        require_trained_projections(
+            tuple(dict.fromkeys(name.split(".")[0] for name in model.new_input_projections.replaced)), config
         )
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)  # for initialisations that PEFT draws
-        wrap_predictor(model, config, start=config.peft.get("init_lora_weights", True))
-    # Check that the adapter can be loaded after it is saved.
+        torch.manual_seed(seed)  # for weights that PEFT initialises
+        wrap_predictor(model, config, initialisation=config.peft.get("init_lora_weights", True))
+    # Raises if the adapter could not be loaded again after it is saved.
     parse_adapter_config(lora_config(model).to_dict(), where="adapter.peft")
     layers = lora_layers(model)
     if config.peft.get("init_lora_weights", True) is True:
@@ -132,18 +132,20 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
     _measure_magnitudes(layers)
 
 
-def with_adapter(predictor: ActionConditionedPredictor, config: AdapterConfig, start: bool | str = True) -> nn.Module:
+def with_adapter(
+    predictor: ActionConditionedPredictor, config: AdapterConfig, initialisation: bool | str = True
+) -> nn.Module:
     """Return a predictor with a LoRA adapter, whose matrices are initialised by PEFT.
 
     Args:
         predictor: The predictor, without an adapter.
         config: The config of the adapter.
-        start: PEFT's `init_lora_weights`.
+        initialisation: PEFT's `init_lora_weights`.
 
     Raises:
-        InputError: A key does not fit the predictor, or PEFT refuses it.
+        InputError: A key does not fit the predictor, or PEFT rejects it.
     """
-    arguments = _peft_arguments(predictor, config) | {"init_lora_weights": start}
+    arguments = _peft_arguments(predictor, config) | {"init_lora_weights": initialisation}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)  # PEFT warns about a pattern that matches no layer
@@ -151,7 +153,7 @@ def with_adapter(predictor: ActionConditionedPredictor, config: AdapterConfig, s
             peft_config._register_custom_module({nn.Linear: LoraLinear})
             wrapped = get_peft_model(predictor, peft_config)
     except (ArithmeticError, AttributeError, RuntimeWarning, TypeError, ValueError, re.error) as error:
-        needed = "options of PEFT's LoraConfig, which fit the predictor"
+        needed = "options of PEFT's LoraConfig that fit the predictor"
         raise InputError(where="adapter.peft", found=str(error), needed=needed) from None
     wrapped.train(predictor.training)  # PEFT creates dropout in training mode
     for name, value in wrapped.named_parameters():
@@ -161,7 +163,7 @@ def with_adapter(predictor: ActionConditionedPredictor, config: AdapterConfig, s
 
 
 def trainable_report(model: WorldModel) -> TrainableReport:
-    """Count the trained parameters (even if currently frozen), those of the predictor without adapter, and all."""
+    """Count the parameters: trained (even if currently frozen), of the predictor without adapter, and in total."""
     trained = 0 if model.adaptation is None else sum(value.numel() for value in _iterate_trained_weights(model))
     predictor = sum(value.numel() for value in base_weights(model.base_predictor).values())
     encoder = sum(value.numel() for value in model.encoder.parameters())
@@ -180,31 +182,31 @@ def require_adaptation(model: WorldModel) -> Adaptation:
         ValueError: The model is not adapted.
     """
     if model.adaptation is None:
-        raise ValueError("this model has not been adapted: add_adapter or load_trained first")
+        raise ValueError("this model is not adapted: call add_adapter or load_trained first")
     return model.adaptation
 
 
 def train_all_weights(model: WorldModel) -> None:
-    """Make every weight of the predictor trainable, except in layers that its sizes do not use."""
-    start = {name: value.detach().to("cpu", copy=True) for name, value in model.predictor.state_dict().items()}
-    model.adaptation = Adaptation("none", model.predictor_fingerprint(), model.encoder_fingerprint(), start)
+    """Make every weight of the predictor trainable, except in layers without input."""
+    weights = {name: value.detach().to("cpu", copy=True) for name, value in model.predictor.state_dict().items()}
+    model.adaptation = Adaptation("none", model.predictor_fingerprint(), model.encoder_fingerprint(), weights)
     model.predictor.float()
     set_trainable(model, trainable=True)
 
 
-def wrap_predictor(model: WorldModel, config: AdapterConfig, start: bool | str = True) -> None:
-    """Add a LoRA adapter to the predictor of a model; raises the errors of `with_adapter`."""
+def wrap_predictor(model: WorldModel, config: AdapterConfig, initialisation: bool | str = True) -> None:
+    """Add a LoRA adapter to the predictor of a model; arguments and errors are those of `with_adapter`."""
     base = model.predictor_fingerprint()
     checkpointing = model.base_predictor.gradient_checkpointing
     # With gradient checkpointing PEFT would add an input hook, which only re-entrant checkpointing needs.
     model.set_gradient_checkpointing(False)
-    model.predictor = with_adapter(model.base_predictor, config, start)
+    model.predictor = with_adapter(model.base_predictor, config, initialisation)
     model.set_gradient_checkpointing(checkpointing)
     model.adaptation = Adaptation("lora", base, model.encoder_fingerprint())
 
 
 def _draw_first_matrices(layers: Mapping[str, Any], generator: torch.Generator) -> None:
-    """Draw the first matrix of each layer as PEFT does, but from a generator; the second one is zero."""
+    """Draw the first matrix of each layer from PEFT's distribution with a generator; the second matrix stays zero."""
     for layer in layers.values():
         matrix = layer.lora_A["default"].weight
         values = torch.empty(matrix.shape)
@@ -213,7 +215,7 @@ def _draw_first_matrices(layers: Mapping[str, Any], generator: torch.Generator) 
 
 
 def _measure_magnitudes(layers: Mapping[str, Any]) -> None:
-    """Set DoRA's magnitudes to the current norms of the rows, computed in float32 as PEFT does in each step."""
+    """Set DoRA's magnitudes to the current norms of the weights' rows, computed in float32 as in PEFT's forward."""
     for layer in layers.values():
         if "default" in layer.lora_magnitude_vector:
             update = layer.lora_B["default"].weight @ layer.lora_A["default"].weight
@@ -226,12 +228,12 @@ def _is_trained_name(name: str) -> bool:
 
 
 def lora_weights(model: WorldModel) -> dict[str, Tensor]:
-    """Return the weights of an adapter by the names of PEFT's file."""
+    """Return the weights of an adapter, by their names in PEFT's file format."""
     return dict(get_peft_model_state_dict(model.predictor, save_embedding_layers=False))
 
 
 def lora_config(model: WorldModel) -> Any:
-    """Return PEFT's config for saving, with names of layers instead of regular expressions from the user."""
+    """Return PEFT's config for a saved adapter, with layer names instead of the user's regular expressions."""
     predictor: Any = model.predictor
     options, layers = predictor.peft_config["default"], lora_layers(model)
     names = [name.removesuffix(".weight") for name in base_weights(model.base_predictor) if name.endswith(".weight")]
@@ -254,44 +256,44 @@ def lora_config(model: WorldModel) -> Any:
         },
     }
     config = LoraConfig(**(options.to_dict() | resolved))
-    config.target_modules = resolved["target_modules"]  # a list, in this order
+    config.target_modules = resolved["target_modules"]  # LoraConfig made a set of it, whose order can change
     return config
 
 
 def set_trainable(model: WorldModel, trainable: bool) -> None:
-    """Unfreeze or freeze the trained weights."""
+    """Unfreeze or freeze the trained weights, and freeze all other weights of the predictor."""
     model.predictor.requires_grad_(False)
     for value in _iterate_trained_weights(model):
         value.requires_grad_(trainable)
 
 
 def _iterate_trained_weights(model: WorldModel) -> Iterator[nn.Parameter]:
-    """Yield the trained weights: an adapter and whole layers, or all weights of the predictor in used layers."""
-    lora = isinstance(model.predictor, PeftModel)
+    """Yield the trained weights: those of an adapter, or all weights of the predictor except in layers without input."""
+    has_adapter = isinstance(model.predictor, PeftModel)
     for name, value in model.predictor.named_parameters():
-        if _is_trained_name(name) if lora else name.split(".", 1)[0] not in model.base_predictor.unused_layers:
+        if _is_trained_name(name) if has_adapter else name.split(".", 1)[0] not in model.base_predictor.unused_layers:
             yield value
 
 
 def parse_adapter_config(values: Mapping[str, Any], *, where: str) -> AdapterConfig:
-    """Return the adapter config for a saved adapter, from its options of PEFT's LoraConfig.
+    """Convert a saved adapter's options of PEFT's LoraConfig to this project's adapter config.
 
-    The file may be untrusted, and PEFT never reads it. Layers are selected by name, never by a regular expression, and
-    options have plain values. No option can therefore run code, take long, or need more memory than an adapter of rank
-    1,024.
+    The file may be untrusted, so PEFT does not read it. Layers must be selected by name, not by a regular expression,
+    and options must have plain values. Therefore no option can run code, take long, or need more memory than an adapter
+    of rank 1,024.
 
     Raises:
         InputError: The values describe another kind of adapter, or contain an option that is not supported.
     """
     defaults: dict[str, Any] = LoraConfig().to_dict()
-    fields: dict[str, Any] = {"kind": "lora", "rslora": False}  # PEFT's default
-    fields |= {ours: values[peft] for peft, ours in PEFT_NAMES.items() if values.get(peft) is not None}
+    fields: dict[str, Any] = {"kind": "lora", "rslora": False}  # False is PEFT's default, not this project's
+    fields |= {key: values[peft_key] for peft_key, key in PEFT_NAMES.items() if values.get(peft_key) is not None}
     options = {name: value for name, value in values.items() if name not in _INFORMATIONAL and name not in PEFT_NAMES}
     options = {name: value for name, value in options.items() if not _is_off(value, defaults.get(name))}
     unsupported = {name: value for name, value in options.items() if not _is_supported(name, value, defaults.get(name))}
     if values.get("peft_type") != "LORA":
         unsupported = {"peft_type": values.get("peft_type")}
-    unsupported |= {peft: None for peft in ("r", "lora_alpha", "target_modules") if values.get(peft) is None}
+    unsupported |= {key: None for key in ("r", "lora_alpha", "target_modules") if values.get(key) is None}
     if unsupported:
         listed = ", ".join(f"{short_repr(name)} {short_repr(value)}" for name, value in unsupported.items())
         problem = f"an adapter with unsupported options: {listed}"
@@ -304,9 +306,9 @@ def _is_off(value: object, default: object) -> bool:
 
 
 def _is_supported(name: str, value: object, default: object) -> bool:
-    """Return whether an option is supported: a pattern of plain layer names, an initialisation, or a number."""
+    """Return whether an option is supported: numbers by plain layer name, an initialisation, or a number."""
     if name in {"rank_pattern", "alpha_pattern"}:
-        types, limit = ((int,), _MOST_RANK) if name == "rank_pattern" else ((int, float), _MOST_ALPHA)
+        types, limit = ((int,), _MAX_RANK) if name == "rank_pattern" else ((int, float), _MAX_ALPHA)
         return isinstance(value, dict) and all(
             _LITERAL.fullmatch(layer) and type(number) in types and 0 < number <= limit
             for layer, number in value.items()
@@ -315,9 +317,9 @@ def _is_supported(name: str, value: object, default: object) -> bool:
 
 
 def _peft_arguments(predictor: ActionConditionedPredictor, config: AdapterConfig) -> dict[str, Any]:
-    """Return the arguments of PEFT's LoraConfig, with sets of targets replaced by the names of layers.
+    """Return the arguments of PEFT's LoraConfig, with sets of targets (such as `attention`) replaced by layer names.
 
-    Layers without input cannot have an adapter; `all` excludes layers that are trained directly.
+    Layers without input cannot have an adapter. The set `all` excludes layers that are trained directly.
 
     Raises:
         InputError: An entry of `targets` or `modules_to_save` matches no layer, or a layer is in both.
@@ -340,8 +342,8 @@ def _peft_arguments(predictor: ActionConditionedPredictor, config: AdapterConfig
         problem = (
             f"{', '.join(in_both)}, which adapter.targets contains, too: a layer is trained directly or with an adapter"
         )
-        raise InputError(where="adapter.modules_to_save", found=problem)
-    arguments = {peft: getattr(config, ours) for peft, ours in PEFT_NAMES.items()}
+        raise InputError(where="adapter.modules_to_save", found=problem, fix="Remove it from one of the two keys")
+    arguments = {peft_key: getattr(config, key) for peft_key, key in PEFT_NAMES.items()}
     return arguments | {"target_modules": targets, "modules_to_save": list(directly_trained) or None} | config.peft
 
 
@@ -352,49 +354,49 @@ def _peft_arguments(predictor: ActionConditionedPredictor, config: AdapterConfig
 def use_base_weights(model: WorldModel) -> Iterator[None]:
     """Make the model predict with the weights of its base model within the `with` block.
 
-    New input layers (`fit_heads`) get their untrained initial values. Such a model must not serve as the base model in
-    a comparison.
+    New input projections (`replace_input_projections`) then have their untrained initial weights. Such a model must not
+    serve as the base model in a comparison.
     """
     if model.adaptation is None:
         yield
         return
-    trained = [(value, value.requires_grad) for value in model.predictor.parameters()]
+    previous = [(value, value.requires_grad) for value in model.predictor.parameters()]
     predictor: Any = model.predictor
-    start = model.adaptation.start
+    weights = model.adaptation.initial_weights
     try:
-        with predictor.disable_adapter() if start is None else _use_weights(predictor, start):
+        with predictor.disable_adapter() if weights is None else _use_weights(predictor, weights):
             yield
     finally:
-        for value, requires_grad in trained:  # PEFT enables gradients when it enables an adapter
+        for value, requires_grad in previous:  # PEFT enables gradients when it enables an adapter
             value.requires_grad_(requires_grad)
 
 
 def merge_adapter(model: WorldModel) -> None:
-    """Merge the trained weights into the predictor in float32, cast it to the base's data type, and freeze it.
+    """Merge the adapter into the predictor in float32, cast it to the base model's data type, and freeze it.
 
-    A surrounding autocast has no effect.
+    A fully fine-tuned predictor is only cast and frozen. A surrounding autocast has no effect.
 
     Raises:
         ValueError: The model is not adapted.
     """
     adaptation = require_adaptation(model)
-    norm_weight = model.base_predictor.predictor_norm.weight  # not trained by adapters: has the base's data type
-    dtype = (adaptation.start or {}).get("predictor_norm.weight", norm_weight).dtype
+    norm_weight = model.base_predictor.predictor_norm.weight  # adapters do not change its data type
+    dtype = (adaptation.initial_weights or {}).get("predictor_norm.weight", norm_weight).dtype
     if adaptation.kind == "lora":
         with torch.autocast(model.device.type, enabled=False):  # otherwise the merge would have autocast's data type
             model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
     model.predictor.to(dtype).requires_grad_(False)
-    model.adaptation = model.new_input_heads = None
+    model.adaptation = model.new_input_projections = None
 
 
 def copy_with_merged_adapter(model: WorldModel) -> WorldModel:
-    """Return a copy for inference that shares the encoder and has a predictor with the adapter merged into it.
+    """Return a copy for inference with the adapter merged into its predictor; the encoder is shared, not copied.
 
     The original model is not changed.
     """
     merged = WorldModel.empty(model.sizes)
     merged.encoder, merged.predictor = model.encoder, copy.deepcopy(model.predictor)
-    merged.adaptation, merged.new_input_heads = model.adaptation, model.new_input_heads
+    merged.adaptation, merged.new_input_projections = model.adaptation, model.new_input_projections
     merged.encoder_origin = model.encoder_origin  # part of the encoder's fingerprint
     if merged.adaptation is not None:
         merge_adapter(merged)

@@ -24,10 +24,10 @@ with quiet_imports():
 
 
 class KeyValueCache:
-    """The rotated keys and the values of earlier steps in all layers of a predictor; empty at first.
+    """The rotated keys and the values of earlier steps in all layers of a predictor. A new cache is empty.
 
-    Gradients flow through the cache into the passes that filled it. The pieces are stored as they were added, and
-    blocks concatenate them during computation, so that no step is stored twice with gradient checkpointing.
+    Gradients flow through the cache into the forward passes that filled it. Each call of `append` stores one piece per
+    layer. Blocks concatenate the pieces during computation, so gradient checkpointing stores no step twice.
     """
 
     def __init__(self, pieces: tuple[tuple[Tensor, ...], ...] = ()) -> None:
@@ -39,7 +39,7 @@ class KeyValueCache:
         return sum(piece.shape[3] for piece in self._pieces[0]) if self._pieces else 0
 
     def layer(self, index: int) -> tuple[Float[Tensor, "2 batch heads _ head_dim"], ...]:
-        """Return the pieces with keys and values of a layer."""
+        """Return the pieces of a layer, each with keys and values."""
         return self._pieces[index] if self._pieces else ()
 
     def append(self, added: Sequence[Float[Tensor, "2 batch heads tokens head_dim"]]) -> None:
@@ -48,12 +48,12 @@ class KeyValueCache:
         self._pieces = tuple((*pieces, piece) for pieces, piece in zip(pieces_by_layer, added, strict=True))
 
     def copy(self) -> KeyValueCache:
-        """Return a cache with the same tensors that can grow independently."""
+        """Return a cache with the same tensors, to which steps can be added independently."""
         return KeyValueCache(self._pieces)
 
 
 class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers has no types
-    """The sizes of a predictor as a config of transformers; `new_predictor` sets them."""
+    """The sizes of a predictor as a config of transformers; `new_predictor` creates it."""
 
     model_type = "vjepa2_ac_predictor"
 
@@ -116,15 +116,15 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
     ) -> Float[Tensor, "batch time tokens dim"]:
         """Return for each step the predicted latents of the next step, not yet normalised.
 
-        Inputs of any float type are cast to the data type of the weights.
+        Inputs may have any float type.
 
         Args:
             latents: The latents of consecutive steps.
             actions: The action of each step.
             states: The state of each step; ignored, and of any width, if the model has no states.
             extrinsics: The camera pose of each step, if the model uses it.
-            cache: The steps follow those in the cache and attend to them; then they are added to the cache.
-            keep: Number of steps, counted from the first, that are added to the cache; None for all steps.
+            cache: Earlier steps, to which these steps attend. These steps are then added to the cache.
+            keep: The number of these steps, counted from the first, that are added to the cache; None for all.
 
         Raises:
             ValueError: Extrinsics are missing or unexpected.
@@ -144,10 +144,11 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         extrinsics: Tensor | None,
         cache: KeyValueCache | None = None,
     ) -> tuple[Tensor, TokenLayout]:
-        """Return the sequence of tokens, step by step, and its layout."""
+        """Return the sequence of tokens, ordered by step, and its layout."""
         if self.config.use_extrinsics != (extrinsics is not None):
             raise ValueError(
-                f"use_extrinsics is {self.config.use_extrinsics}, extrinsics given: {extrinsics is not None}"
+                f"the predictor has use_extrinsics: {self.config.use_extrinsics}, but extrinsics are"
+                f" {'missing' if extrinsics is None else 'passed'}"
             )
         inputs = [(self.action_encoder, actions)]
         inputs += [(self.state_encoder, states)] if self.config.use_states else []
@@ -180,7 +181,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
 
     @property
     def _dtype(self) -> torch.dtype:
-        """The data type of the base weights; directly trained input layers may have another data type."""
+        """The data type of the frozen weights; directly trained projections may have another data type."""
         return self.predictor_norm.weight.dtype
 
     def initialise(self, generator: Generator) -> None:
@@ -189,14 +190,14 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
             initialise(module, generator)
 
     def initialise_near_persistence(self, generator: Generator) -> None:
-        """Initialise the predictor close to persistence: the input layer is a rotation, the output layer its inverse.
+        """Initialise the predictor close to persistence: `predictor_embed` is a rotation, `predictor_proj` its inverse.
 
         Without this initialisation a tiny predictor spends most of its training on learning to copy. A predictor
         narrower than the latents can copy only a random part of them (`ModelSizes.narrow_predictor_warning`).
         """
         shape = self.predictor_embed.weight.shape
         gaussian = torch.randn(max(shape), min(shape), generator=generator, device=generator.device)
-        gaussian = gaussian.double()  # in float32 the last bits would depend on the number of threads
+        gaussian = gaussian.double()  # in float32 the last bits of the QR would depend on the number of threads
         rotation, triangle = torch.linalg.qr(gaussian)
         rotation = rotation * triangle.diagonal().sign()
         with torch.no_grad():
@@ -225,9 +226,9 @@ def new_predictor(sizes: ModelSizes) -> ActionConditionedPredictor:
 
 
 def _apply_in_weight_dtype(layer: Any, values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Apply a layer in the data type of its weights and cast the result to `dtype`, unless autocast does so.
+    """Apply a layer in the data type of its weights and cast the result to `dtype`; with autocast, only apply it.
 
-    A directly trained layer is float32 in a predictor of another data type.
+    A directly trained layer is float32, even in a predictor of another data type.
     """
     if torch.is_autocast_enabled(values.device.type):
         return layer(values)  # type: ignore[no-any-return]  # PEFT's wrapper has no types
@@ -259,9 +260,9 @@ class LatentDynamics(nn.Module):
         cache: KeyValueCache | None = None,
         keep: int | None = None,
     ) -> Float[Tensor, "batch time tokens dim"]:
-        """Return for each step the predicted latents of the next step, from the true latents (teacher forcing).
+        """Return for each step the predicted latents of the next step, given the true latents (teacher forcing).
 
-        With a cache the steps follow those in the cache; the first `keep` steps are added to it (None: all).
+        The arguments are those of `ActionConditionedPredictor.forward`.
         """
         return normalise_latents(self.predictor(latents, actions, states, extrinsics, cache=cache, keep=keep))
 
@@ -275,26 +276,26 @@ class LatentDynamics(nn.Module):
     ) -> Float[Tensor, "batch steps tokens dim"]:
         """Return a rollout: predictions of the steps after the context, each used as input for the next prediction.
 
-        With frames counted from 0, the context contains frames 0 .. context-1 and the result frames context .. time.
-        The first prediction is made from the context alone, so that index h - 1 is horizon h. There are
-        time - context + 1 predictions. The context may end with a prediction, to continue an earlier rollout.
+        With frames counted from 0, the context contains frames 0 .. context-1, and the result contains the
+        time - context + 1 frames context .. time. The first prediction is made from the context alone, so index h - 1
+        of the result is horizon h. The context may end with a prediction, to continue an earlier rollout.
 
-        The context is computed in one pass. Each later step is one pass with cached keys and values. With a cache,
-        context, actions and states follow the steps in the cache. The cache is not changed, so that many rollouts can
-        start from the same cache.
+        The context is computed in one pass. Each later step is one pass with cached keys and values. With `cache`,
+        context, actions and states follow the steps in the cache. The cache is not changed, so many rollouts can start
+        from the same cache.
 
         Raises:
             ValueError: There are fewer actions than context latents.
         """
         first, last = context.shape[1], actions.shape[1]
         if last < first:
-            raise ValueError(f"{last} actions do not reach the end of a context of {first} latents")
+            raise ValueError(f"{last} actions for a context of {first} latents; expected at least {first}")
         cache = KeyValueCache() if cache is None else cache.copy()
         latents, start = context, 0
         predicted = []
         for end in range(first, last + 1):
             camera = None if extrinsics is None else extrinsics[:, start:end]
-            keep = None if end < last else 0  # no later step reads the last step from the cache
+            keep = None if end < last else 0  # the last step is not added, because no step follows it
             following = self.predict(latents, actions[:, start:end], states[:, start:end], camera, cache, keep)
             latents, start = following[:, -1:], end
             predicted.append(latents)

@@ -1,7 +1,7 @@
 """The world model (encoder and predictor): encode, predict, roll out, save and load.
 
-`fit_heads` adds new input layers for robots whose states or actions have other widths than in the base model; these
-layers must be trained.
+For robots whose states or actions have other widths than those of the base model, `replace_input_projections` creates
+new input projections, which must be trained.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
 
 @dataclass(frozen=True)
 class Adaptation:
-    """The adaptation of the predictor by `model.lora`."""
+    """How the predictor was adapted by `model.lora`, and the identity of its base model."""
 
-    kind: Literal["lora", "none"]  # as in config.AdapterConfig; none: all weights are trained
+    kind: Literal["lora", "none"]  # as in config.AdapterConfig; "none" means that all weights are trained
     base: str  # fingerprint of the predictor before training
     encoder: str  # fingerprint of the encoder
-    start: dict[str, Tensor] | None = None  # with kind none: the weights before training
+    initial_weights: dict[str, Tensor] | None = None  # weights before training; None for kind "lora"
 
 
 class Fingerprints(NamedTuple):
@@ -50,28 +50,28 @@ class Fingerprints(NamedTuple):
 
 
 @dataclass(frozen=True)
-class NewInputHeads:
-    """New input layers of the predictor (`fit_heads`), for states or actions of other widths than the base model's."""
+class NewInputProjections:
+    """The record of new input projections (`replace_input_projections`)."""
 
-    replaced: dict[str, Tensor]  # the weights of the base model's layers, by their names in the predictor
-    seed: int  # seed of the new layers
+    replaced: dict[str, Tensor]  # weights of the replaced projections, by their names in the predictor
+    seed: int  # seed of the new weights
 
 
 class RemovedEncoder(nn.Module):
-    """A placeholder for a removed encoder."""
+    """A placeholder for a removed encoder, which keeps the encoder's fingerprint."""
 
     def __init__(self, fingerprint: str) -> None:
         super().__init__()
-        self.fingerprint = fingerprint  # of the removed encoder
+        self.fingerprint = fingerprint
 
 
 class WorldModel(LatentDynamics):
     """A frozen encoder and an action-conditioned predictor.
 
     Latents and predictions are layer-normalised over `dim` without affine parameters, and are float32 for weights of
-    any data type. `model.lora.add_adapter` selects the weights to train; without it all weights are frozen.
+    any data type. All weights are frozen until `model.lora.add_adapter` selects the weights to train.
 
-    Create one with `random`, `from_pretrained` or `model.checkpoints.load_official`.
+    Create a model with `random`, `from_pretrained` or `model.checkpoints.load_official`.
     """
 
     def __init__(self, sizes: ModelSizes) -> None:
@@ -81,7 +81,7 @@ class WorldModel(LatentDynamics):
         self.predictor: nn.Module = new_predictor(sizes)
         self.predictor.requires_grad_(False)
         self.adaptation: Adaptation | None = None
-        self.new_input_heads: NewInputHeads | None = None
+        self.new_input_projections: NewInputProjections | None = None
         self.merged_from: Fingerprints | None = None  # fingerprints before an adapter was merged
         self.encoder_origin: EncoderOrigin | None = None  # None if the encoder was loaded together with the predictor
 
@@ -98,7 +98,7 @@ class WorldModel(LatentDynamics):
         """Return a randomly initialised model, with the same weights for the same sizes, seed and device type.
 
         Weights are drawn as in the released recipe; with `near_persistence` the predictor starts close to persistence.
-        They are drawn on the device; for the full size this takes half a minute on one CPU core.
+        Weights are drawn on `device`. For the released model's size this takes half a minute on one CPU core.
         """
         model = cls.empty(sizes).to_empty(device=device)
         generator = torch.Generator(device).manual_seed(seed)
@@ -116,16 +116,16 @@ class WorldModel(LatentDynamics):
 
     @classmethod
     def empty(cls, sizes: ModelSizes) -> WorldModel:
-        """Return a model in eval mode without weights (on the meta device), into which weights can be loaded."""
+        """Return a model in eval mode on the meta device, which has no values until weights are loaded."""
         with torch.device("meta"):
             return cls(sizes).eval()
 
     @classmethod
     def from_pretrained(cls, folder: str | Path, dtype: torch.dtype | None = None) -> WorldModel:
-        """Load a model from a folder written by `save_pretrained`; `dtype` None keeps the data type of each file.
+        """Load a model from a folder written by `save_pretrained`; with `dtype` None each file keeps its data type.
 
         Raises:
-            InputError: The folder is not a world model, is incomplete or damaged.
+            InputError: The folder is not a world model, or is incomplete or damaged.
         """
         folder = Path(folder)
         model = cls.empty(read_sizes(folder))
@@ -139,7 +139,7 @@ class WorldModel(LatentDynamics):
     def save_pretrained(self, folder: str | Path) -> None:
         """Save the model as config.json, encoder.safetensors and predictor/ (which transformers can load).
 
-        The files are written into a temporary folder and then moved, config.json last, so that a folder with a
+        The files are written into a temporary folder and then moved. config.json is moved last, so a folder with a
         config.json is complete.
 
         Raises:
@@ -156,13 +156,13 @@ class WorldModel(LatentDynamics):
             card["encoder_origin"] = self.encoder_origin.as_dict()
         encoder = self.loaded_encoder
         predictor: Any = self.predictor
-        with folder_writer(Path(folder), CONFIG) as fresh:
-            (fresh / PREDICTOR).parent.mkdir()
-            save_tensors(encoder.state_dict(), fresh / ENCODER)
-            save_tensors(predictor.state_dict(), fresh / PREDICTOR)
+        with folder_writer(Path(folder), CONFIG) as temporary:
+            (temporary / PREDICTOR).parent.mkdir()
+            save_tensors(encoder.state_dict(), temporary / ENCODER)
+            save_tensors(predictor.state_dict(), temporary / PREDICTOR)
             predictor.config.architectures = [type(predictor).__name__]
-            predictor.config.save_pretrained(fresh / "predictor")
-            (fresh / CONFIG).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+            predictor.config.save_pretrained(temporary / "predictor")
+            (temporary / CONFIG).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
     @property
     def image_size(self) -> int:
@@ -176,7 +176,7 @@ class WorldModel(LatentDynamics):
 
     @property
     def latent_dim(self) -> int:
-        """The width of a latent."""
+        """The number of values of each token of a latent."""
         return self.sizes.encoder.width
 
     @property
@@ -212,19 +212,20 @@ class WorldModel(LatentDynamics):
         return rearrange(features, "(batch time) tokens dim -> batch time tokens dim", batch=len(frames))
 
     def encoder_fingerprint(self) -> str:
-        """Return a hash of the encoder's tensors and other properties, which is part of the key of cached latents."""
+        """Return a hash of the encoder's tensors and `encoder_properties`, which is part of a latent cache's key."""
         if isinstance(self.encoder, RemovedEncoder):
             return self.encoder.fingerprint
-        tensors, properties = fingerprint(self.encoder.state_dict()), self.encoder_properties
+        tensor_hash, properties = fingerprint(self.encoder.state_dict()), self.encoder_properties
         if not properties:
-            return tensors
-        return hashlib.sha256(json.dumps([tensors, properties], sort_keys=True).encode()).hexdigest()
+            return tensor_hash
+        return hashlib.sha256(json.dumps([tensor_hash, properties], sort_keys=True).encode()).hexdigest()
 
     @property
     def encoder_properties(self) -> dict[str, str | int]:
-        """The properties on which latents depend, but which the tensors do not determine.
+        """The properties of the encoder on which latents depend, but which its tensors do not determine.
 
-        Empty for tubelets of V-JEPA 2 with the published number of heads, and for a model created with its encoder.
+        The result is empty for an encoder of V-JEPA 2 that has the published number of heads for its width, or that was
+        loaded together with the predictor.
         """
         sizes, origin, properties = self.sizes.encoder, self.encoder_origin, dict[str, str | int]()
         if sizes.family != "v2":
@@ -235,7 +236,7 @@ class WorldModel(LatentDynamics):
 
     @property
     def encoder_description(self) -> str:
-        """A description of the encoder and its origin, for cards."""
+        """A description of the encoder and its origin in words, for the card of an adapter."""
         sizes, frame = self.sizes.encoder, ""
         if sizes.family != "v2":
             frame = f", each frame as {'a tubelet' if sizes.frame == 'tubelet' else 'an image'}"
@@ -243,7 +244,7 @@ class WorldModel(LatentDynamics):
         return f"V-JEPA {sizes.family[1:]}, {sizes.depth} blocks of {sizes.width}, {sizes.heads} heads{frame}{origin}"
 
     def fingerprints(self) -> Fingerprints:
-        """Return the hashes of base and trained weights; for a merged model those before the merge."""
+        """Return the hashes of base and trained weights; for a merged model the hashes before the merge."""
         if self.merged_from is not None:
             return self.merged_from
         adaptation, predictor = self.adaptation, fingerprint(self.predictor.state_dict())
@@ -252,15 +253,15 @@ class WorldModel(LatentDynamics):
         return Fingerprints(self.encoder_fingerprint(), self.predictor_fingerprint(), predictor)
 
     def predictor_fingerprint(self) -> str:
-        """Return a hash of the base model's predictor, independent of an adapter and of new input layers."""
-        replaced = {} if self.new_input_heads is None else self.new_input_heads.replaced
+        """Return a hash of the base model's predictor, independent of an adapter and of new input projections."""
+        replaced = {} if self.new_input_projections is None else self.new_input_projections.replaced
         return fingerprint(base_weights(self.base_predictor) | replaced)
 
 
 def fingerprint(weights: Mapping[str, Tensor]) -> str:
-    """Return the SHA-256 of names, shapes and values rounded to bfloat16.
+    """Return the SHA-256 of the weights' names, shapes, and values rounded to bfloat16.
 
-    Because of the rounding it is the same for a checkpoint loaded as float32 or as bfloat16.
+    Because of the rounding, a checkpoint has the same fingerprint whether it is loaded as float32 or as bfloat16.
     """
     digest = hashlib.sha256()
     for name, value in sorted(weights.items()):
@@ -271,7 +272,7 @@ def fingerprint(weights: Mapping[str, Tensor]) -> str:
 
 
 def base_weights(predictor: nn.Module) -> dict[str, Tensor]:
-    """Return the weights of a predictor by their plain names, without those of an adapter."""
+    """Return the weights of a predictor without its adapter, by their names before PEFT wrapped the predictor."""
     return {
         name.replace(".base_layer.", ".").replace(".original_module.", "."): value
         for name, value in predictor.state_dict().items()
@@ -279,8 +280,8 @@ def base_weights(predictor: nn.Module) -> dict[str, Tensor]:
     }
 
 
-def find_heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
-    """Return the names of the input layers that do not fit states and actions of these widths.
+def find_projections_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
+    """Return the names of the input projections that do not fit states and actions of these widths.
 
     A model without states fits states of any width.
     """
@@ -289,16 +290,16 @@ def find_heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
         "action_encoder": predictor.action_dim == widths.action,
         "state_encoder": not predictor.use_states or predictor.state_dim == widths.state,
     }
-    return tuple(name for name, is_suitable in fits.items() if not is_suitable)
+    return tuple(name for name, is_fitting in fits.items() if not is_fitting)
 
 
-def require_trained_heads(heads: tuple[str, ...], config: AdapterConfig) -> None:
-    """Check that new input layers are trained.
+def require_trained_projections(new: tuple[str, ...], config: AdapterConfig) -> None:
+    """Check that new input projections will be trained.
 
     Raises:
-        InputError: An adapter is trained, and a new layer is not in its modules_to_save; the message shows the setting.
+        InputError: The config is for an adapter without a new projection in modules_to_save. The message shows the fix.
     """
-    missing = [name for name in heads if name not in config.modules_to_save]
+    missing = [name for name in new if name not in config.modules_to_save]
     if config.kind == "none" or not missing:
         return
     layers = ", ".join([*config.modules_to_save, *missing])
@@ -306,47 +307,47 @@ def require_trained_heads(heads: tuple[str, ...], config: AdapterConfig) -> None
     raise InputError(where="adapter.modules_to_save", found=problem, fix=f"Set adapter.modules_to_save=[{layers}]")
 
 
-def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
-    """Replace the input layers that do not fit states and actions of these widths by new layers.
+def replace_input_projections(model: WorldModel, widths: Widths, seed: int) -> list[str]:
+    """Replace the input projections that do not fit states and actions of these widths by new projections.
 
-    The new layers are initialised as in the released recipe, with a seed derived from `seed` and the name of the layer.
-    The fingerprint of the base model (`WorldModel.predictor_fingerprint`) does not change, but the model predicts noise
-    until the new layers are trained.
+    The new projections are initialised as in the released recipe, with a seed derived from `seed` and the name of the
+    layer. The fingerprint of the base model (`WorldModel.predictor_fingerprint`) does not change, but the model predicts
+    noise until the new projections are trained.
 
     Returns:
-        A line for each replaced layer.
+        A message for each replaced projection.
 
     Raises:
-        ValueError: The model has an adapter or new input layers already.
+        ValueError: The model already has an adapter or new input projections.
     """
-    heads = find_heads_to_replace(model.sizes, widths)
-    if not heads:
+    names = find_projections_to_replace(model.sizes, widths)
+    if not names:
         return []
-    if model.adaptation is not None or model.new_input_heads is not None:
-        raise ValueError("input heads can be replaced only once, before the model is adapted")
+    if model.adaptation is not None or model.new_input_projections is not None:
+        raise ValueError("input projections can be replaced only once, before the model is adapted")
     predictor = model.base_predictor
     replaced: dict[str, Tensor] = {}
     lines: list[str] = []
-    for name in heads:
-        old_head, width = getattr(predictor, name), widths.action if name == "action_encoder" else widths.state
-        replaced |= {f"{name}.{key}": value.detach().cpu() for key, value in old_head.state_dict().items()}
-        head = nn.Linear(width, old_head.out_features)
-        initialise(head, torch.Generator().manual_seed(derive_seed(seed, name)))
-        setattr(predictor, name, head.to(old_head.weight.device, old_head.weight.dtype).requires_grad_(False))
-        label, old_width = _join_names([name]), old_head.in_features
+    for name in names:
+        old, width = getattr(predictor, name), widths.action if name == "action_encoder" else widths.state
+        replaced |= {f"{name}.{key}": value.detach().cpu() for key, value in old.state_dict().items()}
+        new = nn.Linear(width, old.out_features)
+        initialise(new, torch.Generator().manual_seed(derive_seed(seed, name)))
+        setattr(predictor, name, new.to(old.weight.device, old.weight.dtype).requires_grad_(False))
+        label, old_width = _join_names([name]), old.in_features
         lines.append(f"New {label} for {width} numbers, newly initialised; the base model's has {old_width}.")
     dims = {"action_dim": widths.action}
     dims |= {"state_dim": widths.state} if model.sizes.predictor.use_states else {}
     predictor.config.update(dims)
     model.sizes = model.sizes.model_copy(update={"predictor": model.sizes.predictor.model_copy(update=dims)})
-    model.new_input_heads = NewInputHeads(replaced, seed)
+    model.new_input_projections = NewInputProjections(replaced, seed)
     return lines
 
 
 def get_model_widths(sizes: ModelSizes) -> Widths:
     """Return the widths of a model's states and actions.
 
-    For a model without states the width of a state equals the width of an action, because a plan adds actions to
+    For a model without states the width of states is set to the width of actions, because a planner adds actions to
     states.
     """
     predictor = sizes.predictor
@@ -363,7 +364,7 @@ def describe_model_widths(sizes: ModelSizes) -> str:
 
 
 def derive_seed(*parts: object) -> int:
-    """Return a seed derived from these values, for example from the seed of the config and a step."""
+    """Return a random seed derived from these values, for example from the seed of the config and a step."""
     digest = hashlib.blake2b("/".join(map(str, parts)).encode(), digest_size=8).digest()
     return int.from_bytes(digest, "big") >> 1
 

@@ -23,7 +23,7 @@ from vjepa2_ac.model.world_model import (
     Fingerprints,
     WorldModel,
     describe_model_widths,
-    find_heads_to_replace,
+    find_projections_to_replace,
     get_model_widths,
 )
 from vjepa2_ac.planning.cameras import Cameras, Fault
@@ -522,7 +522,7 @@ def _require_camera_pose(model: WorldModel, extrinsics: np.ndarray | None, views
 
 
 def _require_spaces(model: WorldModel, spaces: Spaces) -> None:
-    if find_heads_to_replace(model.sizes, spaces.widths):
+    if find_projections_to_replace(model.sizes, spaces.widths):
         needed = (
             f"states of {spaces.widths.state} and actions of {spaces.widths.action} numbers, as in its training data"
         )

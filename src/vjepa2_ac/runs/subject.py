@@ -110,7 +110,7 @@ def describe_untrained_model(config: Config, checkpoint: Path) -> str:
     if config.model.is_random:
         return "untrained model"
     if "fresh_heads" in read_json_object(checkpoint / ADAPTER / CARD, needed="the card of trained weights"):
-        return f"{BASE_MODEL} with untrained input heads"
+        return f"{BASE_MODEL} with untrained input projections"
     if config.adapter.kind == "lora" and config.adapter.peft.get("init_lora_weights") in (False, "orthogonal"):
         return f"{BASE_MODEL} with an untrained adapter"
     return BASE_MODEL

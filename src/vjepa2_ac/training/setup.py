@@ -28,7 +28,7 @@ from vjepa2_ac.model.adapter_folder import read_card
 from vjepa2_ac.model.checkpoints import base_sizes, load_base
 from vjepa2_ac.model.compilation import require_compiler
 from vjepa2_ac.model.lora import add_adapter, trainable_report
-from vjepa2_ac.model.world_model import WorldModel, find_heads_to_replace, fit_heads, require_trained_heads
+from vjepa2_ac.model.world_model import WorldModel, find_projections_to_replace, replace_input_projections, require_trained_projections
 from vjepa2_ac.registry import TRAINING_HOOKS
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import ADAPTER, CHECKPOINTS, RunState, newest_checkpoint, read_written_state
@@ -76,7 +76,7 @@ def set_up(
     dataset, *replay_datasets = run_first_per_machine(accelerator, lambda: open_data_sets(config, reporter))
     for warning in TRAINING_HOOKS.find("motion")(dataset):
         reporter.note(f"Warning: {warning.text}.")
-    _check_heads(config, dataset)
+    _check_input_projections(config, dataset)
     world_model, calibration = None, None
     if config.data.stride == "auto":
         world_model, calibration = TRAINING_HOOKS.find("data.stride")(config, dataset, accelerator, reporter)
@@ -130,8 +130,8 @@ def _require_shared_memory(config: Config, clip: Batch, sizes: ModelSizes, accel
 
 
 def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
-    """Fit the input layers to the data, add an adapter, and apply the `training` options that concern computation."""
-    _fit_heads(world_model, config, dataset, reporter)
+    """Fit the input projections to the data, add an adapter, and apply the `training` options of computation."""
+    _replace_input_projections(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed)
     reporter.note(str(trainable_report(world_model)))
     if problem := config.adapter.alpha_warning:
@@ -145,30 +145,30 @@ def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, r
         world_model.remove_encoder()
 
 
-def _check_heads(config: Config, dataset: Dataset) -> None:
+def _check_input_projections(config: Config, dataset: Dataset) -> None:
     """Refuse, before loading the model, data of other widths than the base model's if the new layers are not trained.
 
     Raises:
-        InputError: A new input layer would not be trained; or `data.stride` is auto, although the base model cannot
+        InputError: A new input projection would not be trained; or `data.stride` is auto, but the base model cannot
             predict from this data.
     """
-    heads, widths = find_heads_to_replace(base_sizes(config.model), dataset.widths), dataset.widths
-    if heads and config.data.stride == "auto":
+    replaced, widths = find_projections_to_replace(base_sizes(config.model), dataset.widths), dataset.widths
+    if replaced and config.data.stride == "auto":
         problem = f"auto, for states of {widths.state} and actions of {widths.action} numbers"
         needed = "the widths with which the base model was trained, because it is evaluated at each candidate stride"
         raise InputError(where="data.stride", found=problem, needed=needed, fix="Set it to a number of control steps")
-    require_trained_heads(heads, config.adapter)
+    require_trained_projections(replaced, config.adapter)
 
 
-def _fit_heads(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
-    """Replace the input layers of a base model that do not fit the widths of the data, and report the new layers."""
-    heads = find_heads_to_replace(world_model.sizes, dataset.widths)
-    for line in fit_heads(world_model, dataset.widths, config.seed):
+def _replace_input_projections(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
+    """Replace the base model's input projections that do not fit the widths of the data; report the new projections."""
+    replaced = find_projections_to_replace(world_model.sizes, dataset.widths)
+    for line in replace_input_projections(world_model, dataset.widths, config.seed):
         reporter.note(line)
     if config.data.states != "vector" or config.adapter.kind == "none" or config.model.is_random:
         return
     for name in ("state_encoder", "action_encoder") if world_model.sizes.predictor.use_states else ("action_encoder",):
-        if name not in {*heads, *config.adapter.modules_to_save}:
+        if name not in {*replaced, *config.adapter.modules_to_save}:
             reporter.note(
                 f"The {name.replace('_', ' ')} of the base model is kept, because its width fits the data. If the"
                 f" numbers have another meaning than in the base model's training data, add {name} to"

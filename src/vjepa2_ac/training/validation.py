@@ -32,7 +32,7 @@ MIN_ACTION_EFFECT = (
 RANKING_REACH_CM = 7.5  # half the width of the box of alternative actions: the motion of a plan in one model step
 _AT_ONCE = 64  # alternative actions per batch, about as many tokens as in a small micro-batch
 _BASE_NOT_CHECKED = (
-    "skipped: the check that the base model is better than persistence. It needs trained input layers, and those for"
+    "skipped: the check that the base model is better than persistence. It needs trained input projections, and those for"
     " this data are new."
 )
 
@@ -179,7 +179,7 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
     config, error = run.config, one_step_over_persistence(validation.errors).value
     if error < 1.0 or config.training.allow_weak_base or config.model.is_random:
         return validation
-    if run.world_model.new_input_heads is not None:
+    if run.world_model.new_input_projections is not None:
         reporter.note(_BASE_NOT_CHECKED)
         return validation
     description = f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame"

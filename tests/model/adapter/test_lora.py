@@ -308,7 +308,7 @@ def test_incomplete_adapter_folder_raises_with_its_path(
     [
         (LORA.model_copy(update={"rank": 2}), r"an adapter with rank 4\. Expected 2, as in the model"),
         (LORA.model_copy(update={"targets": ("q",)}), r"with targets \('fc1', .*Expected \('q',\)"),
-        (FULL, r"an adapter of kind lora, and the model has one of kind none"),
+        (FULL, r"weights of adapter\.kind lora, but the model has adapter\.kind none"),
     ],
 )
 def test_loading_into_an_adapter_with_another_config_raises(

@@ -14,7 +14,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.attention import TokenLayout, rotary_tables
 from vjepa2_ac.model.lora import add_adapter
-from vjepa2_ac.model.world_model import WorldModel, find_heads_to_replace, fit_heads, get_model_widths
+from vjepa2_ac.model.world_model import WorldModel, find_projections_to_replace, replace_input_projections, get_model_widths
 
 STEPS, GRID = 4, 3
 LORA = AdapterConfig(rank=2, alpha=4.0)
@@ -86,11 +86,11 @@ def test_adapter_on_the_missing_state_encoder_raises() -> None:
 
 
 @pytest.mark.parametrize("width", [1, 7, 14])
-def test_states_of_any_width_fit_and_other_action_widths_get_a_new_head(width: int, tmp_path: Path) -> None:
+def test_states_of_any_width_fit_and_another_action_width_needs_a_new_projection(width: int, tmp_path: Path) -> None:
     model = tiny_model(states=False)
-    assert find_heads_to_replace(model.sizes, Widths(width, 7)) == ()
-    assert fit_heads(model, Widths(width, 7), seed=0) == []
-    assert len(fit_heads(model, Widths(width, 14), seed=0)) == 1
+    assert find_projections_to_replace(model.sizes, Widths(width, 7)) == ()
+    assert replace_input_projections(model, Widths(width, 7), seed=0) == []
+    assert len(replace_input_projections(model, Widths(width, 14), seed=0)) == 1
     assert get_model_widths(model.sizes) == Widths(14, 14)
     add_adapter(model, LORA.model_copy(update={"modules_to_save": ("action_encoder",)}), seed=0)
     save_trained(model, tmp_path / "adapter")

@@ -27,7 +27,7 @@ def test_seed_determines_the_weights(fresh: Fresh) -> None:
 
 
 def test_context_longer_than_the_actions_raises(model: WorldModel, inputs) -> None:
-    with pytest.raises(ValueError, match="2 actions do not reach the end of a context of 3"):
+    with pytest.raises(ValueError, match="2 actions for a context of 3 latents"):
         model.rollout(inputs.latents[:, :3], inputs.actions[:, :2], inputs.states[:, :2])
 
 
