@@ -268,7 +268,7 @@ def set_trainable(model: WorldModel, trainable: bool) -> None:
 
 
 def _iterate_trained_weights(model: WorldModel) -> Iterator[nn.Parameter]:
-    """Yield the trained weights: those of an adapter, or all weights of the predictor except in layers without input."""
+    """Yield the trained weights: those of an adapter, or all of the predictor except in layers without input."""
     has_adapter = isinstance(model.predictor, PeftModel)
     for name, value in model.predictor.named_parameters():
         if _is_trained_name(name) if has_adapter else name.split(".", 1)[0] not in model.base_predictor.unused_layers:

@@ -311,8 +311,8 @@ def replace_input_projections(model: WorldModel, widths: Widths, seed: int) -> l
     """Replace the input projections that do not fit states and actions of these widths by new projections.
 
     The new projections are initialised as in the released recipe, with a seed derived from `seed` and the name of the
-    layer. The fingerprint of the base model (`WorldModel.predictor_fingerprint`) does not change, but the model predicts
-    noise until the new projections are trained.
+    layer. The fingerprint of the base model (`WorldModel.predictor_fingerprint`) does not change, but the model
+    predicts noise until the new projections are trained.
 
     Returns:
         A message for each replaced projection.

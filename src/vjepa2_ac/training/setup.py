@@ -28,7 +28,12 @@ from vjepa2_ac.model.adapter_folder import read_card
 from vjepa2_ac.model.checkpoints import base_sizes, load_base
 from vjepa2_ac.model.compilation import require_compiler
 from vjepa2_ac.model.lora import add_adapter, trainable_report
-from vjepa2_ac.model.world_model import WorldModel, find_projections_to_replace, replace_input_projections, require_trained_projections
+from vjepa2_ac.model.world_model import (
+    WorldModel,
+    find_projections_to_replace,
+    replace_input_projections,
+    require_trained_projections,
+)
 from vjepa2_ac.registry import TRAINING_HOOKS
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import ADAPTER, CHECKPOINTS, RunState, newest_checkpoint, read_written_state

@@ -32,8 +32,8 @@ MIN_ACTION_EFFECT = (
 RANKING_REACH_CM = 7.5  # half the width of the box of alternative actions: the motion of a plan in one model step
 _AT_ONCE = 64  # alternative actions per batch, about as many tokens as in a small micro-batch
 _BASE_NOT_CHECKED = (
-    "skipped: the check that the base model is better than persistence. It needs trained input projections, and those for"
-    " this data are new."
+    "skipped: the check that the base model is better than persistence. It needs trained input projections, and"
+    " those for this data are new."
 )
 
 

@@ -14,7 +14,12 @@ from vjepa2_ac.model.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.lora import add_adapter, merge_adapter
 from vjepa2_ac.model.predictor import ActionConditionedPredictor
-from vjepa2_ac.model.world_model import WorldModel, find_projections_to_replace, replace_input_projections, get_model_widths
+from vjepa2_ac.model.world_model import (
+    WorldModel,
+    find_projections_to_replace,
+    get_model_widths,
+    replace_input_projections,
+)
 
 TINY = ModelSizes.model_validate(
     {
@@ -24,7 +29,7 @@ TINY = ModelSizes.model_validate(
     }
 )
 INPUT_PROJECTIONS = ("action_encoder", "state_encoder")
-# With a higher rank the comparisons in float32 would be too inaccurate.
+# With a larger alpha, rounding in float32 would exceed the tolerances of these tests.
 LORA = AdapterConfig(rank=2, alpha=4.0, dropout=0.0, modules_to_save=INPUT_PROJECTIONS)
 FULL = AdapterConfig(kind="none")
 both_kinds = pytest.mark.parametrize("config", [LORA, FULL], ids=["lora", "none"])

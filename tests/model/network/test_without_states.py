@@ -14,7 +14,12 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.attention import TokenLayout, rotary_tables
 from vjepa2_ac.model.lora import add_adapter
-from vjepa2_ac.model.world_model import WorldModel, find_projections_to_replace, replace_input_projections, get_model_widths
+from vjepa2_ac.model.world_model import (
+    WorldModel,
+    find_projections_to_replace,
+    get_model_widths,
+    replace_input_projections,
+)
 
 STEPS, GRID = 4, 3
 LORA = AdapterConfig(rank=2, alpha=4.0)
