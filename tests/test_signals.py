@@ -19,7 +19,7 @@ from vjepa2_ac.process import EXIT_STATUS, SIGNALS, StoppedError, stop_on_signal
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.step import batches_from
+from vjepa2_ac.training.step import iterate_batches
 
 WAITING = """
 import time
@@ -136,7 +136,7 @@ def test_signal_while_data_is_unreachable_stops_before_the_step(
     """The resumed run equals an uninterrupted one: micro-batches of the unfinished step are discarded."""
 
     def stalling(run):
-        for number, batch in enumerate(batches_from(run)):
+        for number, batch in enumerate(iterate_batches(run)):
             if number == 5:  # the second of two micro-batches of step 3
                 os.kill(os.getpid(), signal.SIGTERM)
                 raise UnreachableError(where="data", found="no batch arrived after SIGTERM")
@@ -144,7 +144,7 @@ def test_signal_while_data_is_unreachable_stops_before_the_step(
 
     config = make_config(run_dir=str(tmp_path / "stopped"), checkpoint__keep_best=False)
     with monkeypatch.context() as patch:
-        patch.setattr("vjepa2_ac.training.loop.batches_from", stalling)
+        patch.setattr("vjepa2_ac.training.loop.iterate_batches", stalling)
         with pytest.raises(StoppedError, match="SIGTERM: stopped after step 2"):
             train(config, type(reporter)())
     assert read_state(newest_checkpoint(tmp_path / "stopped/checkpoints")).step == 2

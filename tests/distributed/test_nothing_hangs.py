@@ -92,7 +92,7 @@ def test_relaunched_processes_resume(make_config, tmp_path: Path, popen) -> None
     said, _ = started.communicate(timeout=300)
     assert started.returncode == 0, said
     assert steps_of(run) == [1, 2, 3, 4, 5, 6]
-    assert read_state(newest_checkpoint(run / "checkpoints")).processes == 2
+    assert read_state(newest_checkpoint(run / "checkpoints")).num_processes == 2
 
 
 def test_unexpected_error_of_one_process_ends_all_with_one_error(make_config, tmp_path: Path) -> None:

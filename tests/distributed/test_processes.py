@@ -51,7 +51,7 @@ def test_two_processes_resumed_as_one_equal_a_single_process_run(without_dropout
     assert (quiet_out, quiet_errors) == ("", ""), "only the first process speaks"
     state = read_state(newest_checkpoint(tmp_path / "shared/checkpoints"))
     assert 1 <= state.step < 16
-    assert (state.processes, state.clips_per_step, state.clips_done) == (2, 8, 8 * state.step)
+    assert (state.num_processes, state.clips_per_step, state.clips_done) == (2, 8, 8 * state.step)
     with pytest.raises(StoppedError):
         train(config, signalled_reporter(type(reporter)(), state.step + 1, signal.SIGUSR1))
     train(config, reporter)  # once more: the number of processes is not another any more, and a step not the config's
@@ -71,7 +71,7 @@ def test_two_torchrun_nodes_equal_a_single_process_run(without_dropout, reporter
         words = [str(ROOT / "tests/support/torchrun_forked.py"), *launcher, "train", str(tmp_path / "nodes.yaml")]
         nodes.append(Rank(words, {**os.environ, "OMP_NUM_THREADS": "1"}))
     finish(nodes)
-    assert read_state(newest_checkpoint(tmp_path / "nodes/checkpoints")).processes == 2
+    assert read_state(newest_checkpoint(tmp_path / "nodes/checkpoints")).num_processes == 2
     assert_equal_up_to_rounding(whole, tmp_path / "nodes")
 
 
@@ -88,7 +88,7 @@ def test_clips_of_a_step_do_not_depend_on_the_number_of_processes(
     make_config, reporter, before: int, now: int, each: str | None
 ) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
-    state = RunState(step=3, processes=before, clips_per_step=8 * before, clips_per_process=8)
+    state = RunState(step=3, num_processes=before, clips_per_step=8 * before, clips_per_process=8)
     assert count_micro_batches(config, state, now, reporter) * 2 == state.clips_per_step
     assert [f"computes {each} micro-batches of 2" in note for note in reporter.notes] == [True] * (each is not None)
 

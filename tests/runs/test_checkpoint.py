@@ -320,7 +320,7 @@ def test_optimizer_file_with_code_raises_and_is_not_executed(make_config, report
 
 def test_run_state_round_trip_keeps_every_field(tmp_path: Path) -> None:
     state = RunState(
-        10, run_id="a", clips_done=40, clips_per_step=4, clips_per_process=2, processes=2,
+        10, run_id="a", clips_done=40, clips_per_step=4, clips_per_process=2, num_processes=2,
         data=(DataState("f", 3, {"e": "why"}),), best_step=10, best_error=0.5,
         validation_settings={"data.frames": "16"},
         loss_scale={"scale": 65536.0, "growth_interval": 2000, "_growth_tracker": 0, "growth_factor": float("inf")},

@@ -25,7 +25,7 @@ from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.training.resume import save_checkpoint
-from vjepa2_ac.training.step import Run, gradients, training_step
+from vjepa2_ac.training.step import Run, compute_gradients, training_step
 
 
 def batches(run: Run, read: list[list[int]]) -> Iterator[Batch]:
@@ -35,7 +35,7 @@ def batches(run: Run, read: list[list[int]]) -> Iterator[Batch]:
 
 def gradient_of(run: Run, read: list[list[int]]) -> tuple[object, list[torch.Tensor]]:
     run.optimizer.zero_grad(set_to_none=True)
-    taken = gradients(run, batches(run, read))
+    taken = compute_gradients(run, batches(run, read))
     return taken, [p.grad for p in run.world_model.parameters() if p.grad is not None]
 
 

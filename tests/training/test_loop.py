@@ -20,7 +20,7 @@ from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_s
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.training import outputs, validation
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.step import batches_from, training_step
+from vjepa2_ac.training.step import iterate_batches, training_step
 
 
 def test_resumed_run_equals_an_uninterrupted_run(make_config, reporter, tmp_path, whole_run) -> None:
@@ -88,7 +88,7 @@ def test_accumulated_micro_batches_equal_one_large_batch(make_config, reporter) 
         run = set_up(config, reporter)
         run.optimizer.step = lambda: None
         run.optimizer.zero_grad = lambda **_: None
-        training_step(run, batches_from(run), 1)
+        training_step(run, iterate_batches(run), 1)
         return {name: p.grad for name, p in run.world_model.named_parameters() if p.grad is not None}
 
     big, small = gradients(4, 1), gradients(1, 4)
@@ -173,7 +173,7 @@ def test_bf16_run_keeps_trained_weights_in_float32(make_config: object, reporter
 
 def test_resumed_run_remembers_broken_episodes(make_config, reporter, monkeypatch) -> None:
     read, config = loader.read_clip, make_config(training__steps=2, data__broken_episodes="skip")
-    bad = next(batches_from(set_up(config, reporter))).episode_ids[0]
+    bad = next(iterate_batches(set_up(config, reporter))).episode_ids[0]
 
     def read_some(dataset: Dataset, wish: ClipRequest) -> Clip:
         if dataset.table.identity(wish.episode) == bad:

@@ -14,7 +14,7 @@ from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training.cuda_graph import Body, GraphedMicroStep
-from vjepa2_ac.training.step import Run, batches_from, encode, micro_step, training_step
+from vjepa2_ac.training.step import Run, encode, iterate_batches, micro_step, training_step
 
 STEPS = 3
 NEEDS_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -77,9 +77,9 @@ def recorded(run: Run) -> Recorder:
 @pytest.mark.parametrize("order", [lambda batches: batches, uneven], ids=["even", "uneven"])
 def test_training_with_a_captured_micro_step_equals_training_without(make_run, order) -> None:
     plain, other = (make_run() for _ in range(2))
-    expected = learned(plain, order(batches_from(plain)))
+    expected = learned(plain, order(iterate_batches(plain)))
     recorder = recorded(other)
-    found = learned(other, order(batches_from(other)))
+    found = learned(other, order(iterate_batches(other)))
     assert all(map(torch.equal, found, expected))
     assert recorder.captures == 1
     assert recorder.replays == 2 * STEPS - (2 if order is uneven else 0)
@@ -88,7 +88,7 @@ def test_training_with_a_captured_micro_step_equals_training_without(make_run, o
 def test_capture_adds_to_existing_gradients(make_run) -> None:
     run = make_run()
     run.world_model.train()
-    first, second = (encode(run, batch) for batch in itertools.islice(batches_from(run), 2))
+    first, second = (encode(run, batch) for batch in itertools.islice(iterate_batches(run), 2))
     recorder = recorded(run)
 
     def gradients(*steps: Callable[..., Tensor]) -> list[Tensor]:
@@ -105,7 +105,7 @@ def test_capture_adds_to_existing_gradients(make_run) -> None:
 @NEEDS_CUDA
 def test_training_with_a_cuda_graph_equals_training_without(make_run) -> None:
     runs = [make_run(training__device="cuda", training__cuda_graph=graph) for graph in (False, True)]
-    expected, found = (learned(run, batches_from(run)) for run in runs)
+    expected, found = (learned(run, iterate_batches(run)) for run in runs)
     assert isinstance(runs[1].micro_step, GraphedMicroStep)
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)

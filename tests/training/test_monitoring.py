@@ -27,21 +27,21 @@ def test_update_to_weight_covers_all_tensors() -> None:
     update = Update([one, other])
     one += 0.3
     other += 0.8
-    assert update.to_weight() == pytest.approx(1.0 / 10.0)
+    assert update.relative_norm() == pytest.approx(1.0 / 10.0)
 
 
 def test_throughput_counts_clips_tokens_and_flops_per_second() -> None:
     config = parse_config({"run_dir": "r", "data": {"path": "d", "frames": 8}, "model": {"base": "b"}}, where="test")
     sizes, speed = ModelSizes(), measure_matmul_speed(CPU, torch.bfloat16)
-    throughput = Throughput.of(config, sizes, SimpleNamespace(device=CPU, num_processes=2))
-    metrics = throughput.metrics(clips=12.0, seconds=4.0, waited_s=1.0)
+    throughput = Throughput.measure(config, sizes, SimpleNamespace(device=CPU, num_processes=2))
+    metrics = throughput.compute_metrics(clips=12.0, seconds=4.0, waited_s=1.0)
     assert metrics["samples_per_second"] == 3.0
     assert metrics["data_wait_share"] == 0.25
     mfu = 3.0 * clip_flops(config, sizes).total / (2 * speed)
     usable = replace(throughput, ceiling=2 * mfu * throughput.ceiling)
-    assert usable.metrics(clips=12.0, seconds=4.0, waited_s=1.0)["mfu"] == pytest.approx(0.5)
+    assert usable.compute_metrics(clips=12.0, seconds=4.0, waited_s=1.0)["mfu"] == pytest.approx(0.5)
     unusable = replace(throughput, ceiling=mfu * throughput.ceiling / 7)
-    assert math.isnan(unusable.metrics(clips=12.0, seconds=4.0, waited_s=1.0)["mfu"]), "700 % is no utilisation"
+    assert math.isnan(unusable.compute_metrics(clips=12.0, seconds=4.0, waited_s=1.0)["mfu"]), "700 % is no utilisation"
     assert metrics["ceiling_tflops"] == pytest.approx(2 * speed / 1e12)
     assert metrics.keys() == MACHINE_METRICS
 

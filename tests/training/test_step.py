@@ -20,7 +20,7 @@ from vjepa2_ac.episode import Batch, Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import save_checkpoint
-from vjepa2_ac.training.step import Gradients, Run, batches_from, gradients, training_step
+from vjepa2_ac.training.step import Gradients, Run, compute_gradients, iterate_batches, training_step
 
 
 def prepared(make_config: Any, reporter: Any, batch_size: int, accumulation: int, **changes: Any) -> Run:
@@ -33,7 +33,7 @@ def prepared(make_config: Any, reporter: Any, batch_size: int, accumulation: int
 
 def step_gradients(run: Run, batches: list[Batch]) -> tuple[Gradients, dict[str, torch.Tensor]]:
     run.optimizer.zero_grad(set_to_none=True)
-    metrics = gradients(run, iter(batches))
+    metrics = compute_gradients(run, iter(batches))
     return metrics, {n: p.grad.clone() for n, p in run.world_model.named_parameters() if p.grad is not None}
 
 
@@ -133,7 +133,7 @@ def test_the_loss_scale_is_restored(make_config, reporter, tmp_path) -> None:
 @pytest.fixture
 def bad_clip(make_config: Any, reporter: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[str, int]:
     """Replace a state of the second clip of a run by NaN when it is read."""
-    read, batch = loader.read_clip, next(batches_from(set_up(make_config(), reporter)))
+    read, batch = loader.read_clip, next(iterate_batches(set_up(make_config(), reporter)))
     bad = (batch.episode_ids[1], batch.starts[1])
 
     def poisoned(*arguments: Any) -> Clip:

@@ -216,8 +216,8 @@ def _doctor(options: argparse.Namespace) -> int:
     """Estimate whether a run fits on this GPU, or describe this machine.
 
     With a config, the GPU memory is estimated part by part with a training step on fake tensors; no weights are loaded.
-    Without a config, versions and hardware are printed. Exit status 0: the run fits. 1: it does not fit. 2: an input
-    cannot be used.
+    On a machine without a GPU, the estimate is compared with 24 GB. Without a config, versions and hardware are
+    printed. Exit status 0: the run fits. 1: it does not fit. 2: an input cannot be used.
     """
     if options.config is None:
         for line in _report_lines():
@@ -269,10 +269,14 @@ def _verdict(needed: int, available: int, gpu: str | None, overrides: list[str] 
         overrides: `key=value` changes with which the run fits; None: there are none.
     """
     fits, size, capacity = needed <= available, f"{needed / 1e9:.1f} GB", f"{available / 1e9:.1f} GB"
-    text = f"{'Fits' if fits else 'Does not fit'}: the estimated peak is {size}; {gpu or 'a usual GPU'} has {capacity}."
+    if gpu is None:
+        comparison = f"a GPU with {capacity} is {'large enough' if fits else 'too small'}"
+        text = f"No GPU: PyTorch finds none on this machine. The estimated peak is {size}; {comparison}."
+    else:
+        text = f"{'Fits' if fits else 'Does not fit'}: the estimated peak is {size}; {gpu} has {capacity}."
     if not fits:
         text += f" It fits with {', '.join(overrides)}." if overrides else " It needs a larger GPU or a smaller model."
-    return text if gpu else f"{text}\nThis machine: not measured; it needs a GPU, PyTorch finds none."
+    return text
 
 
 def _report_lines() -> Iterator[str]:

@@ -53,11 +53,13 @@ def describe_missing_compiler(device: str) -> str | None:
     """Describe what this machine lacks for compilation on a device type (cpu or cuda); None if nothing is missing."""
     if device == "cuda" and not has_triton():
         return "Triton is not installed"
-    configured = os.environ.get("CC" if device == "cuda" else "CXX")
-    compilers = ("gcc", "clang") if device == "cuda" else ("g++", "clang++")
+    variable, compilers = ("CC", ("gcc", "clang")) if device == "cuda" else ("CXX", ("g++", "clang++"))
+    configured = os.environ.get(variable)
     if any(map(shutil.which, (configured,) if configured else compilers)):
         return None
-    return f"no compiler is found ({configured or ' or '.join(compilers)})"
+    if configured:
+        return f"the compiler {configured} (environment variable {variable}) is not installed"
+    return f"no C{'' if device == 'cuda' else '++'} compiler is installed ({' or '.join(compilers)})"
 
 
 def require_compiler(device: str, *, where: str) -> None:
@@ -73,7 +75,8 @@ def require_compiler(device: str, *, where: str) -> None:
     missing = describe_missing_compiler(device)
     if missing:
         hint = " (Triton comes with PyTorch for CUDA)" if device == "cuda" else ""
-        raise InputError(where=where, found=f"blocks, but {missing}", fix=f"Set {where}=off, or install it{hint}")
+        fix = f"Install what is missing{hint}, or set {where}=off"
+        raise InputError(where=where, found=f"blocks is not possible: {missing}", fix=fix)
 
 
 @cache

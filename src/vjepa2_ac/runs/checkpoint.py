@@ -50,6 +50,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 _FILE_KEYS = {  # attribute of `RunState` -> key in state.json, where they differ
     "clips_per_process": "clips_asked",
+    "num_processes": "processes",
     "best_ranking_error": "best_rank",
     "lowest_ranking_error": "lowest_rank",
     "base_ranking_error": "base_rank",
@@ -62,7 +63,7 @@ class DataState:
     """A data set as used by a run so far."""
 
     fingerprint: str  # hash of the episodes
-    windows: Count  # number of clips per epoch, on which their order depends
+    windows: Count  # number of clips per epoch; the order of the clips depends on it
     broken: Mapping[str, str]  # episodes that could not be read -> reason
 
 
@@ -75,13 +76,13 @@ class RunState:
     clips_done: Count = 0  # position in the sequence of clips of the whole run
     clips_per_step: PositiveInt | None = None  # summed over all processes
     clips_per_process: PositiveInt | None = None  # per process, from the config: batch_size * accumulation
-    processes: PositiveInt = 1
+    num_processes: PositiveInt = 1
     best_step: Count | None = None  # step of the best validation by checkpoint.keep_best; 0: before training
     best_error: Finite | None = None  # rollout error of the best validation
     best_ranking_error: Finite | None = None  # action-ranking error of the best validation, with keep_best=ranking
     lowest_ranking_error: Finite | None = None  # lowest action-ranking error of all validations
     base_ranking_error: Finite | None = None  # action-ranking error before the first step, with keep_best=ranking
-    validation_settings: Mapping[str, str] | None = None  # settings that its errors depend on; see `training.resume`
+    validation_settings: Mapping[str, str] | None = None  # settings that affect the errors; see `training.resume`
     loss_scale: Mapping[str, int | float] | None = None  # state of the gradient scaler, with fp16
     data: tuple[DataState, ...] = ()  # the data set and, if configured, the replay data set
 

@@ -7,7 +7,7 @@ differed by 1 % from the peak that PyTorch's allocator reported; the CUDA contex
 
 The fake tensors are on the CPU, because fake CUDA tensors need a driver. Three operations are replaced, so that they
 keep as much memory as on CUDA: autocast computes norms from a float32 copy if the weights have another data type than
-the arithmetic, a dropout mask takes one byte per element, and `auto` attention is one operation (FlexAttention) that
+the computation, a dropout mask takes one byte per element, and `auto` attention is one operation (FlexAttention) that
 keeps no scores.
 
 All blocks after the first need the same memory. Models with two and with three blocks show how much each further block
@@ -38,17 +38,17 @@ from vjepa2_ac.model.low_rank import CastMatrices
 from vjepa2_ac.model.predictor import LatentDynamics, new_predictor
 from vjepa2_ac.training.step import Objective
 
-Kind = Literal["cpu", "cuda"]
+DeviceType = Literal["cpu", "cuda"]
 
 GIGABYTE = 10**9
-ALLOWANCE = 3 * GIGABYTE // 2  # CUDA context 0.5, cuBLAS workspaces, fragmentation: not computed but assumed
+ALLOWANCE = 3 * GIGABYTE // 2  # assumed: 0.5 GB for the CUDA context, 1 GB for cuBLAS workspaces and fragmentation
 USUAL_GPU = 24 * GIGABYTE
 FLOAT32 = 4
 HALF = 2  # bfloat16 and float16
 
 _BLOCKS = (2, 3)  # numbers of blocks of the two measured models
-_BYTES_OF_CACHED = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
-_SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # elements, as in bitsandbytes
+_BYTES_PER_CACHED_NUMBER = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
+_MIN_8_BIT_ELEMENTS, _ELEMENTS_PER_SCALE = 4096, 256  # as in bitsandbytes
 _CHECKPOINTED = ", checkpointed"
 _PERMANENT_PARTS = (  # parts that are allocated all the time
     "encoder weights", "predictor weights", "trained weights", "optimizer state", "CUDA allowance",
@@ -65,11 +65,11 @@ class StepBytes(NamedTuple):
 
     stored: int  # forward and backward pass, without gradient checkpointing
     checkpointed: int  # forward and backward pass, with gradient checkpointing
-    casts: int  # copies of the adapter's matrices in the data type of the arithmetic, for all micro-steps
+    casts: int  # copies of the adapter's matrices in the data type of the computation, for all micro-steps
     predicting: int  # prediction of all steps of a validation batch
 
 
-_measured: dict[str, StepBytes] = {}
+_measured: dict[str, StepBytes] = {}  # results of `measure_step` by config, sizes and device
 
 
 def meta_predictor(config: Config, sizes: ModelSizes) -> nn.Module:
@@ -90,7 +90,7 @@ def meta_predictor(config: Config, sizes: ModelSizes) -> nn.Module:
         return with_adapter(predictor.requires_grad_(False), config.adapter)
 
 
-def _batch(config: Config, sizes: ModelSizes, clips: int) -> LatentBatch:
+def _make_batch(config: Config, sizes: ModelSizes, clips: int) -> LatentBatch:
     frames, predictor = config.data.frames, sizes.predictor
     latents = torch.empty(clips, frames, sizes.tokens_per_frame, sizes.encoder.width)
     states = torch.empty(clips, frames, predictor.state_dim)
@@ -99,7 +99,7 @@ def _batch(config: Config, sizes: ModelSizes, clips: int) -> LatentBatch:
     return LatentBatch(latents, states, actions, extrinsics, ("",) * clips, (0,) * clips)
 
 
-def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> StepBytes:
+def measure_step(config: Config, sizes: ModelSizes, device: DeviceType = "cuda") -> StepBytes:
     """Return the peak memory of a micro-step of a run.
 
     Args:
@@ -119,14 +119,14 @@ def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> St
             predictors = (sizes.predictor.model_copy(update={"depth": blocks}) for blocks in _BLOCKS)
             models = (sizes.model_copy(update={"predictor": predictor}) for predictor in predictors)
             fewer, more = (_measure(config, model, device) for model in models)
-            further = depth - _BLOCKS[0]
-            peaks = tree_map(lambda two, three: two + further * (three - two), fewer, more)
+            num_further = depth - _BLOCKS[0]
+            peaks = tree_map(lambda two, three: two + num_further * (three - two), fewer, more)
         _measured[key] = StepBytes(*map(max, peaks))
     return _measured[key]
 
 
 class LiveStorages:
-    """A count of the bytes of tensor storages, from the first call of `count` until a storage is freed.
+    """A counter of the bytes of live tensor storages: from the first call of `count` until the storage is freed.
 
     Args:
         block: The size of each storage is rounded up to a multiple of this number of bytes, as an allocator does.
@@ -169,7 +169,7 @@ class _StorageCounter(TorchDispatchMode):  # type: ignore[no-untyped-call]  # to
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        if "out" in kwargs:  # the storage is counted already, and PyTorch takes milliseconds to check its shape
+        if "out" in kwargs:  # counted already; PyTorch would take milliseconds to check its shape
             return kwargs["out"]
         outputs = func(*args, **kwargs)
         for leaf in tree_leaves(outputs):
@@ -185,22 +185,22 @@ class _StorageCounter(TorchDispatchMode):  # type: ignore[no-untyped-call]  # to
 class _FakeModel(LatentDynamics):
     """The predictor of a run on fake tensors, in training mode. Usable only inside `FakeTensorMode`."""
 
-    def __init__(self, config: Config, predictor: nn.Module, device: Kind, storages: LiveStorages) -> None:
+    def __init__(self, config: Config, predictor: nn.Module, device: DeviceType, storages: LiveStorages) -> None:
         super().__init__()
         self.predictor, self._storages = predictor, storages
         self.peaks: list[int] = []  # bytes, one per phase
-        frozen = torch.bfloat16 if config.model.dtype == "bfloat16" else torch.float32
+        frozen_dtype = torch.bfloat16 if config.model.dtype == "bfloat16" else torch.float32
         for module in predictor.modules():
             for name, old in module.named_parameters(recurse=False):
-                is_float = old.requires_grad or config.adapter.kind == "none"
-                values = torch.empty(old.shape, dtype=torch.float32 if is_float else frozen)
+                is_float32 = old.requires_grad or config.adapter.kind == "none"
+                values = torch.empty(old.shape, dtype=torch.float32 if is_float32 else frozen_dtype)
                 new = nn.Parameter(values, old.requires_grad)
                 new.grad = torch.empty_like(new) if new.requires_grad else None  # as after an earlier micro-step
                 module.register_parameter(name, new)
             if device == "cuda":
                 module.__class__ = _ON_CUDA.get(type(module), type(module))
-        kind = config.training.attention
-        self.set_attention(_flash if device == "cuda" and kind == "auto" else kind)
+        attention = config.training.attention
+        self.set_attention(_fused_attention if device == "cuda" and attention == "auto" else attention)
 
     def predict(self, *args: Any, **kwargs: Any) -> Tensor:
         """Predict and end a phase; end another phase when the backward pass reaches this prediction."""
@@ -217,7 +217,7 @@ class _FakeModel(LatentDynamics):
 
     def run(self, config: Config, sizes: ModelSizes, clips: int, *, train: bool) -> tuple[int, ...]:
         """Return the peak of each phase of a micro-step; with `train=False`, of a prediction without gradients."""
-        batch = _batch(config, sizes, clips)
+        batch = _make_batch(config, sizes, clips)
         states, cameras = batch.states[:, :-1], None if batch.extrinsics is None else batch.extrinsics[:, :-1]
         self._storages.forget()
         self.peaks.clear()
@@ -233,10 +233,10 @@ class _FakeModel(LatentDynamics):
         return tuple(self.peaks)
 
 
-def _measure(config: Config, sizes: ModelSizes, device: Kind) -> tuple[tuple[int, ...], ...]:
+def _measure(config: Config, sizes: ModelSizes, device: DeviceType) -> tuple[tuple[int, ...], ...]:
     """Return for each field of `StepBytes` the bytes of each phase."""
     predictor = meta_predictor(config, sizes)
-    rotary_tables.cache_clear()  # neither use real tables from earlier calls nor leave fake tables for later calls
+    rotary_tables.cache_clear()  # earlier calls cached real tables, and later calls must not use fake ones
     try:
         with FakeTensorMode(), _StorageCounter() as counter:
             model = _FakeModel(config, predictor, device, counter.storages)
@@ -267,7 +267,7 @@ class _CudaDropout(nn.Dropout):
 _ON_CUDA: dict[type[nn.Module], type[nn.Module]] = {nn.LayerNorm: _CudaNorm, nn.Dropout: _CudaDropout}
 
 
-def _flash(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:  # noqa: ARG001
+def _fused_attention(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:  # noqa: ARG001
     return scaled_dot_product_attention(query, key, value)
 
 
@@ -276,7 +276,7 @@ def _flash(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> T
 
 @dataclass(frozen=True)
 class Parameters:
-    """Exact numbers of parameters."""
+    """Numbers of parameters of a model."""
 
     encoder: int
     predictor: int  # without the trained parameters of an adapter
@@ -359,25 +359,25 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
 
 def suggest_memory_savings(config: Config, sizes: ModelSizes, available: int) -> list[str] | None:
     """Return the config changes after which a run fits into `available` bytes; None if all of them do not suffice."""
-    applied, total = list[str](), _total(config, sizes)
-    for override, changes in _memory_savings(config):
+    applied, total = list[str](), _estimate_total(config, sizes)
+    for override, changes in _list_memory_savings(config):
         if total <= available:
             break
         sections = {name: getattr(config, name).model_copy(update=values) for name, values in changes.items()}
         lighter = config.model_copy(update=sections)
-        if (less := _total(lighter, sizes)) < total:
+        if (lighter_total := _estimate_total(lighter, sizes)) < total:
             applied.append(
                 f"{override} replay.{override}" if config.replay and override.startswith("data.") else override
             )
-            config, total = lighter, less
+            config, total = lighter, lighter_total
     return applied if total <= available else None
 
 
-def _total(config: Config, sizes: ModelSizes) -> int:
+def _estimate_total(config: Config, sizes: ModelSizes) -> int:
     return estimate_memory(config, sizes).total(checkpointing=config.training.gradient_checkpointing)
 
 
-def _memory_savings(config: Config) -> Iterator[tuple[str, dict[str, dict[str, Any]]]]:
+def _list_memory_savings(config: Config) -> Iterator[tuple[str, dict[str, dict[str, Any]]]]:
     """Yield the changes that save memory, preferred ones first: the text to print, and the new values by section."""
     yield "training.gradient_checkpointing=true", {"training": {"gradient_checkpointing": True}}
     yield "training.batch_size=1 (and raise training.accumulation by the same factor)", {"training": {"batch_size": 1}}
@@ -385,8 +385,8 @@ def _memory_savings(config: Config) -> Iterator[tuple[str, dict[str, dict[str, A
     yield "model.dtype=bfloat16 with training.precision=bf16", bf16
     if not (config.data.transforms or config.data.uses_cached_latents):
         yield "data.cache=auto", {"data": {"cache": "auto"}}
-    fewest = max(8, config.training.rollout_steps + 1)
-    yield "data.frames=8", {"data": {"frames": min(config.data.frames, fewest)}}
+    frames = min(config.data.frames, max(8, config.training.rollout_steps + 1))
+    yield f"data.frames={frames}", {"data": {"frames": frames}}
     yield "training.optimizer=adamw_8bit", {"training": {"optimizer": "adamw_8bit"}}
     if not config.model.is_random:
         yield "adapter.kind=lora", {"adapter": {"kind": "lora"}}
@@ -399,17 +399,17 @@ def _moment_bytes(config: Config, elements: int) -> int:
 
     Source: bitsandbytes 0.50, optim/optimizer.py, Optimizer2State.init_state.
     """
-    if config.training.optimizer == "adamw" or elements < _SMALLEST_IN_8_BITS:
+    if config.training.optimizer == "adamw" or elements < _MIN_8_BIT_ELEMENTS:
         return 2 * elements * FLOAT32
-    return 2 * (elements + -(-elements // _ELEMENTS_OF_A_SCALE) * FLOAT32)
+    return 2 * (elements + -(-elements // _ELEMENTS_PER_SCALE) * FLOAT32)
 
 
 def batch_bytes(config: Config, sizes: ModelSizes, clips: int) -> int:
-    """Return the bytes of a batch from the loader: latents, or frames, assumed to have the model's image size."""
+    """Return the bytes of a batch from the loader: cached latents, or frames, if they have the model's image size."""
     frames = clips * config.data.frames
     if not config.data.uses_cached_latents:
         return frames * 3 * sizes.image_size**2
-    return frames * sizes.tokens_per_frame * sizes.encoder.width * _BYTES_OF_CACHED[config.data.cache_dtype]
+    return frames * sizes.tokens_per_frame * sizes.encoder.width * _BYTES_PER_CACHED_NUMBER[config.data.cache_dtype]
 
 
 def _latent_bytes(config: Config, sizes: ModelSizes, clips: int) -> int:
@@ -431,7 +431,7 @@ def _encoder_bytes(config: Config, sizes: ModelSizes, frames: int) -> int:
     width, hidden = sizes.encoder.width, int(sizes.encoder.width * sizes.encoder.mlp_ratio)
     number = FLOAT32 if config.training.precision == "fp32" else HALF
     tokens = min(ENCODE_CHUNK, frames) * sizes.tokens_per_frame
-    attention = width * (4 * number + 5 * FLOAT32)  # residual, query, key, value; normed, and four while rotating
+    attention = width * (4 * number + 5 * FLOAT32)  # residual, query, key, value; normed and four while rotating
     mlp = width * (2 * number + 2 * FLOAT32) + 2 * hidden * number  # residual and output; normed, cast; around GELU
     pixels = frames * 3 * sizes.image_size**2 * FLOAT32
     features = frames * sizes.tokens_per_frame * width * 2 * FLOAT32  # as computed, and normalised

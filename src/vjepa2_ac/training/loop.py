@@ -1,7 +1,7 @@
 """The training loop.
 
 A run is reproducible because the clips of a step, its learning rate and its random numbers are pure functions of
-(config, step). A run that was killed continues from its newest checkpoint as if it had not been interrupted.
+(config, step). A killed run resumes from its newest checkpoint, with the same result as an uninterrupted run.
 `examples/train_loop.py` is the same algorithm without processes, checkpoints and signals.
 """
 
@@ -22,7 +22,7 @@ from vjepa2_ac.training.optim import require_optimizer
 from vjepa2_ac.training.outputs import RunOutputs
 from vjepa2_ac.training.resume import restore
 from vjepa2_ac.training.setup import set_up
-from vjepa2_ac.training.step import Run, batches_from, gradients, training_step
+from vjepa2_ac.training.step import Run, compute_gradients, iterate_batches, training_step
 from vjepa2_ac.training.validation import record, validate_base, validate_if_due
 
 _CHECKS_PASSED = "All checks passed: data, model, validation and gradients. Nothing was written."
@@ -42,7 +42,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
 
     Raises:
         InputError: An input cannot be used; raised before the first step wherever possible.
-        StoppedError: A signal asked the run to stop between its first and last step; see `process`.
+        StoppedError: A signal stopped the run before its last step; see `process`.
     """
     changes = {"check_only": check_only, "allow_config_change": allow_config_change}
     with contextlib.ExitStack() as exit_stack, join_processes(config) as accelerator:
@@ -58,7 +58,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
             outputs.report_changes(run)
             if check_only:
                 reporter.task("computing one optimizer step")
-                gradients(run, batches_from(run))
+                compute_gradients(run, iterate_batches(run))
                 reporter.note(_CHECKS_PASSED)
             else:
                 outputs.begin(run)
@@ -72,11 +72,11 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
 def _optimize(run: Run, outputs: RunOutputs, reporter: Reporter) -> None:
     """Run the remaining steps."""
     reporter.on_start(run.state.step, run.config.training.steps)
-    throughput = Throughput.of(run.config, run.world_model.sizes, run.accelerator)
-    with contextlib.closing(batches_from(run)) as batches:
+    throughput = Throughput.measure(run.config, run.world_model.sizes, run.accelerator)
+    with contextlib.closing(iterate_batches(run)) as batches:
         timed = TimedBatches(batches, run.accelerator.device)
         while outputs.has_next_step:
-            step, started, waited_s = run.state.step + 1, time.perf_counter(), timed.waited_s
+            step, started_s, waited_s = run.state.step + 1, time.perf_counter(), timed.waited_s
             try:
                 metrics = training_step(run, timed, step, measure_update=outputs.is_logged(step))
             except UnreachableError:
@@ -84,8 +84,8 @@ def _optimize(run: Run, outputs: RunOutputs, reporter: Reporter) -> None:
                     raise
                 break
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
-            clips = run.clips_per_step - metrics.get("clips_left_out", 0.0)
-            metrics |= throughput.metrics(clips, time.perf_counter() - started, timed.waited_s - waited_s)
+            num_clips = run.clips_per_step - metrics.get("clips_left_out", 0.0)
+            metrics |= throughput.compute_metrics(num_clips, time.perf_counter() - started_s, timed.waited_s - waited_s)
             outputs.on_step(metrics)
             is_best = validate_if_due(run, outputs.metrics_log, reporter)
             outputs.save_if_due(is_best=is_best)

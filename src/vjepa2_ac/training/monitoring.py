@@ -8,7 +8,7 @@ data_wait_share     share of the step's wall time spent waiting for the loader; 
 samples_per_second  clips per second, summed over all processes
 mfu                 model FLOPs per second (`training.flops`) divided by the ceiling: the rate of this device in a large
                     matrix product in the run's precision, measured for a fraction of a second at the start. NaN (null)
-                    above 1: other programs used the device during that measurement, so the ceiling is not usable
+                    above 1, because other programs then used the device during the measurement of the ceiling
 ceiling_tflops      this ceiling in 10^12 FLOPs per second, summed over all processes
 memory_gb           peak so far in 10^9 bytes: PyTorch's allocator on CUDA, resident memory on other devices
 """
@@ -80,9 +80,9 @@ class DivergenceDetector:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._reported: set[str] = set()
-        self._at_start: Mapping[str, Any] = {}  # metrics of the validation before the first step
+        self._initial_metrics: Mapping[str, Any] = {}  # metrics of the validation before the first step
         self._losses: deque[float] = deque(maxlen=_NUM_LOSSES)
-        self._lowest = math.inf
+        self._lowest_median = math.inf
 
     def __call__(self, kind: str, step: int, metrics: Mapping[str, Any]) -> str:
         """Return the warning for a row; empty if there is no cause, or if the cause was reported before."""
@@ -90,23 +90,23 @@ class DivergenceDetector:
         if kind == "train":
             causes = self._check_loss(_number(metrics, "loss"))
         elif kind == "validation" and step == 0:
-            self._at_start = metrics
+            self._initial_metrics = metrics
         elif kind == "validation":
             causes = self._check_validation(metrics)
-        new = {cause: text for cause, text in causes if cause not in self._reported}
-        self._reported |= set(new)
+        new_causes = {cause: text for cause, text in causes if cause not in self._reported}
+        self._reported |= set(new_causes)
         training = self._config.training
         fix = (
             f"If this persists, lower training.learning_rate ({training.learning_rate:g}) or adapter.alpha, or raise"
             f" training.warmup_steps ({training.warmup_steps:,})"
         )
-        return f"at step {step:,} {'; '.join(new.values())}. {fix}" if new else ""
+        return f"at step {step:,} {'; '.join(new_causes.values())}. {fix}" if new_causes else ""
 
     def _check_validation(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        better = True
+        is_better = True
         for key, name in _ERRORS.items():
-            now, before = _number(metrics, key), _number(self._at_start, key)
-            better &= now < before
+            now, before = _number(metrics, key), _number(self._initial_metrics, key)
+            is_better &= now < before
             if not math.isfinite(now):
                 yield "not finite", "an error of the validation is not a finite number"
             elif now > _MIN_INCREASE * before:
@@ -114,23 +114,24 @@ class DivergenceDetector:
                 text = f"the {name} in validation is {now:.3f} of persistence's (before training {before:.3f})"
                 yield name + copying, text + copying
         error = "action_ranking_error"
-        if _number(metrics, f"{error}_low") > _number(self._at_start, f"{error}_high"):  # intervals are apart
-            now, before = (100 * _number(row, error) for row in (metrics, self._at_start))
+        low, initial_high = _number(metrics, f"{error}_low"), _number(self._initial_metrics, f"{error}_high")
+        if low > initial_high:
+            now, before = (100 * _number(row, error) for row in (metrics, self._initial_metrics))
             text = f"the action-ranking error is {now:.1f} % (before training {before:.1f} %, chance 50 %)"
-            text += ", although predictions are better than the base model's" if better else ""
+            text += ", although predictions are better than the base model's" if is_better else ""
             yield "rank", f"{text}. `vjepa2-ac data check` measures how diverse the motions of the data are"
 
     def _check_loss(self, loss: float) -> Iterator[tuple[str, str]]:
         if not math.isfinite(loss):  # a step without readable clips
             return
         self._losses.append(loss)
-        typical = statistics.median(self._losses)
+        median = statistics.median(self._losses)
         if len(self._losses) >= _MIN_LOSSES:
-            self._lowest = min(self._lowest, typical)
-        if typical > _LOSS_RATIO * self._lowest:
+            self._lowest_median = min(self._lowest_median, median)
+        if median > _LOSS_RATIO * self._lowest_median:
             yield (
                 "loss",
-                f"the loss is {typical:.4g}, its minimum was {self._lowest:.4g} (medians of {_NUM_LOSSES} rows)",
+                f"the loss is {median:.4g}, its minimum was {self._lowest_median:.4g} (medians of {_NUM_LOSSES} rows)",
             )
 
 
@@ -147,27 +148,27 @@ class TimedBatches(Iterator[Batch]):
     def __init__(self, batches: Iterator[Batch], device: torch.device) -> None:
         self._batches, self._waited_s = batches, 0.0
         self._device = device
-        self._spans: deque[tuple[Any, Any]] = deque()  # events that the device may not have reached yet
+        self._spans: deque[tuple[Any, Any]] = deque()  # start and end events, not necessarily reached by the device
 
     @property
     def waited_s(self) -> float:
         """The waiting time in seconds, up to the last event that the device has reached; does not synchronize."""
         while self._spans and self._spans[0][1].query():
-            began, ended = self._spans.popleft()
-            self._waited_s += began.elapsed_time(ended) / 1000
+            start, end = self._spans.popleft()
+            self._waited_s += start.elapsed_time(end) / 1000  # milliseconds to seconds
         return self._waited_s
 
     def __next__(self) -> Batch:
         """Return the next batch."""
-        began = time.perf_counter()
-        on_device = self._timestamp()
+        start_s = time.perf_counter()
+        start_event = self._timestamp()
         try:
             return next(self._batches)
         finally:
-            if on_device is None:
-                self._waited_s += time.perf_counter() - began
+            if start_event is None:
+                self._waited_s += time.perf_counter() - start_s
             else:
-                self._spans.append((on_device, self._timestamp()))
+                self._spans.append((start_event, self._timestamp()))
 
     def _timestamp(self) -> Any:
         """Record and return a CUDA event with timing; return None on other devices."""
@@ -187,7 +188,7 @@ class Throughput:
     device: torch.device
 
     @classmethod
-    def of(cls, config: Config, sizes: ModelSizes, accelerator: Accelerator) -> Throughput:
+    def measure(cls, config: Config, sizes: ModelSizes, accelerator: Accelerator) -> Throughput:
         """Measure the ceiling (once per process, device and precision), and count the FLOPs of a clip.
 
         The FLOPs include the encoder unless latents are cached.
@@ -197,7 +198,7 @@ class Throughput:
         flops = clip_flops(config, sizes)
         return cls(flops.predictor if config.data.uses_cached_latents else flops.total, ceiling, device)
 
-    def metrics(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
+    def compute_metrics(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
         """Return the metrics of one step.
 
         Args:

@@ -38,7 +38,7 @@ def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.O
     """
     groups = parameter_groups(module, training.weight_decay)
     if training.optimizer == "adamw_8bit":
-        return _adamw_8bit()(groups, lr=training.learning_rate, betas=_BETAS)  # type: ignore[no-any-return]
+        return _import_adamw_8bit()(groups, lr=training.learning_rate, betas=_BETAS)  # type: ignore[no-any-return]
     fused = True if _are_on_cuda(trained_parameters(module)) else None
     return torch.optim.AdamW(groups, lr=training.learning_rate, betas=_BETAS, fused=fused)
 
@@ -50,16 +50,16 @@ def require_optimizer(training: TrainingConfig) -> None:
         UnreachableError: The library is not installed.
     """
     if training.optimizer == "adamw_8bit":
-        _adamw_8bit()
+        _import_adamw_8bit()
 
 
 def _are_on_cuda(parameters: Iterable[nn.Parameter]) -> bool:
     return all(parameter.device.type == "cuda" for parameter in parameters)
 
 
-def _adamw_8bit() -> Any:
-    called = "bitsandbytes, which training.optimizer=adamw_8bit needs"
-    return require_library("bitsandbytes.optim", where="training.optimizer", called=called, extra="8bit").AdamW8bit
+def _import_adamw_8bit() -> Any:
+    library = "bitsandbytes, which training.optimizer=adamw_8bit needs"
+    return require_library("bitsandbytes.optim", where="training.optimizer", called=library, extra="8bit").AdamW8bit
 
 
 def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
@@ -81,7 +81,7 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
 
 
 def learning_rate_at(step: int, training: TrainingConfig) -> float:
-    """Return the learning rate of an optimizer step in 1..steps. A pure function: there is no scheduler state to save.
+    """Return the learning rate of an optimizer step in 1..steps. There is no scheduler state to save.
 
     Source: warmup_stable_decay is facebookresearch/vjepa2 @ c2963a4, src/utils/schedulers.py, WSDSchedule.
     """
@@ -89,12 +89,12 @@ def learning_rate_at(step: int, training: TrainingConfig) -> float:
     if step <= warmup:
         return peak * step / warmup
     if training.schedule == "cosine":
-        done = (step - warmup) / max(1, training.steps - warmup)
-        return peak * 0.5 * (1.0 + math.cos(math.pi * min(1.0, done)))
-    first_decay = training.steps - training.decay_steps
-    if step <= first_decay or not training.decay_steps:
+        progress = (step - warmup) / max(1, training.steps - warmup)
+        return peak * 0.5 * (1.0 + math.cos(math.pi * min(1.0, progress)))
+    decay_start = training.steps - training.decay_steps
+    if step <= decay_start or not training.decay_steps:
         return peak
-    return peak - peak * min(1.0, (step - first_decay) / training.decay_steps)
+    return peak - peak * min(1.0, (step - decay_start) / training.decay_steps)
 
 
 def describe_changed_rate(step: int, before: TrainingConfig, now: TrainingConfig) -> str:

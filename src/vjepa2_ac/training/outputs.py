@@ -64,7 +64,7 @@ class RunOutputs:
         self._reporter, self._exit_stack = reporter, exit_stack
         self.metrics_log: MetricsLog | None = None
         self._mirror: Mirror | None = None
-        self._stopped_by = 0  # number of a signal
+        self._stopped_by = 0  # number of the signal that stopped the run; 0: none
         self._saved_s, self._saved_step = 0.0, 0  # of the last checkpoint: `begin` sets both
 
         def open_folder() -> OpenRun:
@@ -94,7 +94,7 @@ class RunOutputs:
         return True
 
     def report_changes(self, run: Run) -> None:
-        """Print the config changes since the last start, and the learning rate if they change it."""
+        """Print the config changes since the last start, and the learning rate if a change affects it."""
         if self._open_run is None:
             return
         changes = config_changes(run.config)
@@ -107,10 +107,10 @@ class RunOutputs:
     def begin(self, run: Run) -> None:
         """Open the metrics log, the trackers and the mirror, and install the signal handlers."""
         self._run, self._saved_step, self._saved_s = run, run.state.step, time.monotonic()
-        run_on_all(run.accelerator, self._begin)
+        run_on_all(run.accelerator, self._open_files)
         self._stop = self._exit_stack.enter_context(stop_on_signals())
 
-    def _begin(self) -> None:
+    def _open_files(self) -> None:
         if self._open_run is None:
             return
         run, step, run_id = self._run, self._run.state.step, self._run.state.run_id
@@ -152,15 +152,15 @@ class RunOutputs:
         is_due = step % run.config.checkpoint.every == 0 or time.monotonic() - self._saved_s >= SAVE_EVERY_S
         is_due = is_due or is_best or is_finished(run.config, run.state)
         is_due = is_due or (self.metrics_log is not None and self.metrics_log.has_unwritten_rows)
-        stopped_by, due = all_reduce(run.accelerator, [self._stop.number, is_due], "max")
+        stopped_by, is_due_anywhere = all_reduce(run.accelerator, [self._stop.number, is_due], "max")
         self._stopped_by = int(stopped_by)
-        if due or self._stopped_by:
+        if is_due_anywhere or self._stopped_by:
             self.save()
         if self._mirror is not None:
             self._mirror.upload_if_due()
 
     def save(self) -> None:
-        """Save a checkpoint, after the metrics of all steps up to it."""
+        """Save a checkpoint, after writing the metrics of all steps before it."""
 
         def write() -> None:
             with self.metrics_log.flush_before_checkpoint() if self.metrics_log else contextlib.nullcontext():

@@ -49,9 +49,9 @@ def save_checkpoint(run: Run, folder: Path) -> None:
         InputError: The checkpoint cannot be written; raised in the first process only.
     """
 
-    def write(inner: Path) -> None:
-        save_trained(run.world_model, inner / ADAPTER)
-        with (inner / OPTIMIZER).open("wb") as file:
+    def write(checkpoint: Path) -> None:
+        save_trained(run.world_model, checkpoint / ADAPTER)
+        with (checkpoint / OPTIMIZER).open("wb") as file:
             write_torch(run.optimizer.state_dict(), file)
 
     run.state = replace(
@@ -62,7 +62,7 @@ def save_checkpoint(run: Run, folder: Path) -> None:
         ),
         clips_per_step=run.clips_per_step,
         clips_per_process=run.config.training.batch_size * run.config.training.accumulation,
-        processes=run.accelerator.num_processes,
+        num_processes=run.accelerator.num_processes,
         loss_scale=run.scaler.state_dict() if run.scaler.is_enabled() else None,
     )
     if run.accelerator.is_main_process:
@@ -128,15 +128,15 @@ def validation_settings(config: Config, dataset: Dataset) -> Mapping[str, str]:
     return {**settings, _CLIPS_KEY: hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}
 
 
-def keep_comparable_best(state: RunState, now: Mapping[str, str], reporter: Reporter) -> RunState:
-    """Return the state to resume from, without its best validation if that was measured differently than now.
+def keep_comparable_best(state: RunState, settings: Mapping[str, str], reporter: Reporter) -> RunState:
+    """Return the state to resume from; the best validation is removed if it was measured with other settings.
 
-    Errors are comparable only for the same clips, time span and latents. Settings that only one of the two records
-    contains are ignored.
+    Errors are comparable only for the same clips, time span and latents. Settings that are recorded only in `state` or
+    only in `settings` are ignored.
     """
     before = state.validation_settings or {}
-    differing = sorted(key for key in before.keys() & now if before[key] != now[key])
-    state = replace(state, validation_settings=dict(now))
+    differing = sorted(key for key in before.keys() & settings if before[key] != settings[key])
+    state = replace(state, validation_settings=dict(settings))
     names = ["validation clips" if key == _CLIPS_KEY else key for key in differing]
     if not differing or state.best_error is None:
         return state
@@ -154,7 +154,7 @@ def keep_comparable_best(state: RunState, now: Mapping[str, str], reporter: Repo
     )
 
 
-def count_micro_batches(config: Config, state: RunState, processes: int, reporter: Reporter) -> int:
+def count_micro_batches(config: Config, state: RunState, num_processes: int, reporter: Reporter) -> int:
     """Return the number of micro-batches per step, summed over all processes.
 
     At the first start, or after a change of batch_size * accumulation, the config determines the number. Otherwise the
@@ -165,21 +165,21 @@ def count_micro_batches(config: Config, state: RunState, processes: int, reporte
         InputError: There are more processes than micro-batches.
     """
     batch_size, accumulation = config.training.batch_size, config.training.accumulation
-    configured = accumulation * processes
+    configured = accumulation * num_processes
     if state.clips_per_step is None or state.clips_per_process != batch_size * accumulation:
         return configured
     micro_batches = state.clips_per_step // batch_size
-    if micro_batches < processes:
-        problem = f"{counted(processes, 'process')}, each with micro-batches of {counted(batch_size, 'clip')}"
+    if micro_batches < num_processes:
+        problem = f"{counted(num_processes, 'process')}, each with micro-batches of {counted(batch_size, 'clip')}"
         clips = counted(state.clips_per_step, "clip")
         needed = f"at most {counted(micro_batches, 'process')}, because a step of this run has {clips}"
         fix = "Start fewer processes, or change training.batch_size and training.accumulation with"
         raise InputError(where="training.batch_size", found=problem, needed=needed, fix=f"{fix} --allow-config-change")
     if micro_batches != configured:
-        fewest, remainder = divmod(micro_batches, processes)
+        fewest, remainder = divmod(micro_batches, num_processes)
         each = f"{fewest} or {fewest + 1}" if remainder else f"{fewest}"
         reporter.note(
-            f"{counted(processes, 'process')} instead of {state.processes}: each computes {each} micro-batches of"
-            f" {counted(batch_size, 'clip')}. A step still has {counted(state.clips_per_step, 'clip')}."
+            f"{counted(num_processes, 'process')} instead of {state.num_processes}: each computes {each} micro-batches"
+            f" of {counted(batch_size, 'clip')}. A step still has {counted(state.clips_per_step, 'clip')}."
         )
     return micro_batches

@@ -1,4 +1,4 @@
-"""Setup of a run before the first step: device, data, model, adapter and optimizer, with checks."""
+"""Set up a run before the first step: device, data, model, adapter and optimizer, with checks."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def set_up(
         world_model, calibration = TRAINING_HOOKS.find("data.stride")(config, dataset, accelerator, reporter)
         config, dataset = config.with_stride(calibration.stride), dataset.with_stride(calibration.stride)
     splits: tuple[Split, ...] = ("train", "validation", "test") if config.data.test_share else ("train", "validation")
-    clip, *_ = [first_clip(dataset, split) for split in splits]  # fails early: an empty split, a broken clip
+    clip, *_ = [first_clip(dataset, split) for split in splits]  # an empty split or a broken clip raises here
     require_fitting_clips(dataset, replay_datasets)
     if not allow_config_change:
         run_on_first(accelerator, lambda: require_same_data(config, (dataset, *replay_datasets)))
@@ -135,7 +135,7 @@ def _require_shared_memory(config: Config, clip: Batch, sizes: ModelSizes, accel
 
 
 def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
-    """Fit the input projections to the data, add an adapter, and apply the `training` options of computation."""
+    """Fit the input projections to the data, add an adapter, and apply the `training` options of the computation."""
     _replace_input_projections(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed)
     reporter.note(str(trainable_report(world_model)))
@@ -151,7 +151,7 @@ def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, r
 
 
 def _check_input_projections(config: Config, dataset: Dataset) -> None:
-    """Refuse, before loading the model, data of other widths than the base model's if the new layers are not trained.
+    """Refuse data that needs new input projections which the config does not train; called before loading the model.
 
     Raises:
         InputError: A new input projection would not be trained; or `data.stride` is auto, but the base model cannot

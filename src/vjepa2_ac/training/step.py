@@ -44,7 +44,7 @@ class Run:
     accelerator: Accelerator  # device, precision, and the rank of this process
     world_model: WorldModel
     objective: Callable[[LatentBatch], tuple[Tensor, Tensor]]  # (teacher forcing, rollout)
-    micro_step: Callable[[Run, LatentBatch, float], Tensor]  # the function `micro_step`, or its CUDA graph
+    micro_step: Callable[[Run, LatentBatch, float], Tensor]  # the function `micro_step`, or a `GraphedMicroStep`
     optimizer: torch.optim.Optimizer
     scaler: torch.amp.GradScaler  # only active with fp16
     dataset: Dataset
@@ -52,7 +52,7 @@ class Run:
     micro_batches: int  # number per optimizer step, summed over all processes
     calibration: Mapping[str, Any] | None = None  # how the stride was chosen; None unless data.stride was auto
     replay_dataset: Dataset | None = None
-    image_strip: Any = None  # the hook `validation.decoder`: decoding.imagine.ValidationStrip
+    image_strip: Any = None  # decoding.imagine.ValidationStrip, if `validation.decoder` is set
 
     @property
     def folder(self) -> Path:
@@ -85,7 +85,7 @@ class Run:
         return ProcessShare(self.accelerator.process_index, self.accelerator.num_processes, self.micro_batches)
 
 
-def batches_from(run: Run) -> Batches:
+def iterate_batches(run: Run) -> Batches:
     """Return an iterator over the micro-batches of this process, starting at the current step."""
     replay = run.config.replay
     return training_loader(
@@ -120,12 +120,12 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     Raises:
         InputError: The loss or a gradient is not finite; names the clips. The weights are unchanged.
     """
-    # The random numbers of a step (dropout) follow from its number: no generator state needs to be saved.
+    # Dropout is seeded by the number of the step, so that no generator state needs to be saved.
     torch.manual_seed(derive_seed(run.config.seed, step, run.accelerator.process_index))
     learning_rate = learning_rate_at(step, run.config.training)
     for group in run.optimizer.param_groups:
         group["lr"] = learning_rate
-    computed = gradients(run, batches)
+    computed = compute_gradients(run, batches)
     update = Update(run.trained) if measure_update else None
     if computed.clips:  # without a clip there are no gradients, and the weights stay unchanged
         run.scaler.step(run.optimizer)  # skips the update after an overflow in fp16
@@ -139,7 +139,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
         "learning_rate": learning_rate,
     }
     if update is not None:
-        metrics["update_to_weight"] = update.to_weight()
+        metrics["update_to_weight"] = update.relative_norm()
     if any(data.broken_episodes == "skip" for data in run.config.data_sets):
         metrics["clips_left_out"] = float(run.clips_per_step - computed.clips)
     if run.scaler.is_enabled():
@@ -147,7 +147,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     return metrics
 
 
-def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
+def compute_gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
     """Accumulate and clip the gradients of the next micro-batches of all processes; the weights are unchanged.
 
     Loss and gradient are means over the clips of the step. If clips are skipped (`data.broken_episodes=skip`), they
@@ -158,8 +158,9 @@ def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
         batches: Source of micro-batches.
 
     Raises:
-        InputError: A loss or gradient is not finite; the message names the clips of this process. A process cannot read
-            a clip, or all processes together have too many broken episodes; in these two cases all raise an error.
+        InputError: A loss or gradient is not finite (the message names the clips of this process), a process cannot
+            read a clip, or all processes together have too many broken episodes. In the last two cases all processes
+            raise an error.
     """
     if not run.world_model.training:  # after a validation
         run.world_model.train()
@@ -170,31 +171,31 @@ def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
     except UserError as raised:
         error = raised
     sums = [*totals.tolist(), len(names), error is not None]  # `tolist` synchronizes with the device
-    *losses, clips, failed = all_reduce(run.accelerator, sums, "sum")
-    if failed:
+    *losses, num_clips, num_failed = all_reduce(run.accelerator, sums, "sum")
+    if num_failed:
         raise_first_error(run.accelerator, error)
     expected = run.clips_per_step
-    if clips < expected:
-        _share_broken_episodes(run)
-    if not clips:
+    if num_clips < expected:
+        _exchange_broken_episodes(run)
+    if not num_clips:
         return Gradients(math.nan, math.nan, 0.0, clips=0)
-    forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
-    norm = _finish_gradients(run, factor=expected / clips)
-    _refuse_not_finite(run, forced_loss + rollout_loss, norm, names)
-    return Gradients(forced_loss, rollout_loss, norm, int(clips))
+    forced_loss, rollout_loss = (loss * (expected / num_clips) for loss in losses)
+    norm = _finish_gradients(run, factor=expected / num_clips)
+    _require_finite(run, forced_loss + rollout_loss, norm, names)
+    return Gradients(forced_loss, rollout_loss, norm, int(num_clips))
 
 
 def _accumulate(run: Run, batches: Iterator[Batch]) -> tuple[Float[Tensor, 2], list[str]]:
-    """Return this process's share of both losses, and the names of its clips."""
+    """Add the gradients of this process's micro-batches; return their share of both losses, and the clips' names."""
     totals, names = torch.zeros(2, device=run.accelerator.device), list[str]()
     for _ in run.share.micro_batches:
         batch = next(batches)
         if not batch.starts:
             continue
         names += [f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)]
-        parts = run.clips_per_step / len(batch.starts)
-        losses = run.micro_step(run, encode(run, batch), parts)
-        totals += losses / parts
+        loss_divisor = run.clips_per_step / len(batch.starts)
+        losses = run.micro_step(run, encode(run, batch), loss_divisor)
+        totals += losses / loss_divisor
     return totals, names
 
 
@@ -204,11 +205,11 @@ def encode(run: Run, batch: Batch) -> LatentBatch:
         return encode_batch(run.world_model, batch, device=run.accelerator.device)
 
 
-def micro_step(run: Run, latents: LatentBatch, parts: float) -> Float[Tensor, 2]:
-    """Add the gradient of (both losses / `parts`); return (teacher forcing, rollout), each a mean over these clips."""
+def micro_step(run: Run, latents: LatentBatch, loss_divisor: float) -> Float[Tensor, 2]:
+    """Add the gradient of (loss / `loss_divisor`); return (teacher forcing, rollout), each a mean over these clips."""
     with run.accelerator.autocast():
         forced, rollout = run.objective(latents)
-    run.scaler.scale((forced + rollout) / parts).backward()  # type: ignore[no-untyped-call]  # torch
+    run.scaler.scale((forced + rollout) / loss_divisor).backward()  # type: ignore[no-untyped-call]  # torch
     return torch.stack([forced.detach(), rollout.detach()])
 
 
@@ -287,7 +288,7 @@ def _finish_gradients(run: Run, factor: float) -> float:
     return float(nn.utils.clip_grad_norm_(run.trained, math.inf if limit is None else limit))
 
 
-def _share_broken_episodes(run: Run) -> None:
+def _exchange_broken_episodes(run: Run) -> None:
     """Exchange the lists of broken episodes between all processes, because their limit applies to the whole run.
 
     Raises:
@@ -299,12 +300,12 @@ def _share_broken_episodes(run: Run) -> None:
                 dataset.broken.record(name, reason)
 
 
-def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str]) -> None:
+def _require_finite(run: Run, loss: float, norm: float, clip_names: list[str]) -> None:
     may_be_overflow = run.scaler.is_enabled() and run.scaler.get_scale() >= SMALLEST_LOSS_SCALE
     if math.isfinite(loss) and (math.isfinite(norm) or may_be_overflow):
         return
     fp16 = ", or set training.precision to bf16 or fp32" if run.scaler.is_enabled() else ""
-    problem = f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}"
+    problem = f"a loss or gradient that is not finite; the clips were {'; '.join(clip_names)}"
     fix = f"The weights are unchanged. Inspect these clips, or lower training.learning_rate{fp16}"
     raise InputError(where="training", found=problem, fix=fix)
 
@@ -320,9 +321,9 @@ class Update:
         self._parameters = list(parameters)
         self._before = [parameter.detach().clone() for parameter in self._parameters]
 
-    def to_weight(self) -> float:
-        """Return norm(update) / norm(weights before), over all tensors together. May be called only once."""
-        weight = float(torch.nn.utils.get_total_norm(self._before))
+    def relative_norm(self) -> float:
+        """Return norm(update) / norm(weights before the step), over all tensors together. May be called only once."""
+        weight_norm = float(torch.nn.utils.get_total_norm(self._before))
         for before, parameter in zip(self._before, self._parameters, strict=True):
             before -= parameter.detach()  # in place, to need no further memory
-        return float(torch.nn.utils.get_total_norm(self._before)) / weight if weight else math.nan
+        return float(torch.nn.utils.get_total_norm(self._before)) / weight_norm if weight_norm else math.nan

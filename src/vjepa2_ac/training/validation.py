@@ -30,7 +30,7 @@ MIN_ACTION_EFFECT = (
     0.02  # relative increase of the one-step error with shuffled actions, below which a model ignores its actions
 )
 RANKING_REACH_CM = 7.5  # half the width of the box of alternative actions: the motion of a plan in one model step
-_AT_ONCE = 64  # alternative actions per batch, about as many tokens as in a small micro-batch
+_AT_ONCE = 64  # alternative actions per batch, with about the number of tokens of a small micro-batch
 _BASE_NOT_CHECKED = (
     "skipped: the check that the base model is better than persistence. It needs trained input projections, and"
     " those for this data are new."
@@ -38,13 +38,13 @@ _BASE_NOT_CHECKED = (
 
 
 def validate_if_due(run: Run, metrics_log: MetricsLog | None, reporter: Reporter) -> bool:
-    """Run and log the validation if it is due; return whether its result is the best so far."""
+    """Run and log the validation if it is due; return whether the result is the best so far."""
     step, config = run.state.step, run.config
     if step % config.validation.every != 0 and step != config.training.steps:
         return False
     result = validate(run, reporter)
-    is_first = step - config.validation.every < max(1, config.training.warmup_steps) <= step
-    if (is_first or step == config.training.steps) and (warning := action_warning(result)):
+    is_first_after_warmup = step - config.validation.every < max(1, config.training.warmup_steps) <= step
+    if (is_first_after_warmup or step == config.training.steps) and (warning := action_warning(result)):
         reporter.note(warning)
     return record(run, result, metrics_log)
 
@@ -62,7 +62,7 @@ def action_warning(validation: Validation) -> str:
 
 
 def record(run: Run, validation: Validation, metrics_log: MetricsLog | None) -> bool:
-    """Log a validation; return whether its result is the best so far, as `checkpoint.keep_best` defines it."""
+    """Log a validation; return whether it is the best so far by the criterion `checkpoint.keep_best`."""
     metrics = validation_metrics(validation)
     if metrics_log is not None:
         metrics_log.write("validation", run.state.step, metrics)
@@ -132,16 +132,16 @@ def _measure(run: Run) -> Validation:
     read = partial(read_batches, run.dataset, batch_size=run.config.validation.batch_size, allow_empty=True)
     batches, moves = read(windows[windows_range.start : windows_range.stop]), list[RolloutStart]()
     names = [(run.dataset.table.identity(episode), start) for episode, start in windows]
-    chosen = {names[index] for index in spread_indices(len(names), run.config.validation.ranking_clips or 0)}
-    encoded = _encoded(run, batches, chosen, moves)
+    ranking_clips = {names[index] for index in spread_indices(len(names), run.config.validation.ranking_clips or 0)}
+    encoded = _encode_batches(run, batches, ranking_clips, moves)
     errors = prediction_errors(run.world_model, encoded, before=previous_clip_actions(windows_range, windows, read))
     for name, reason in gather_shared(list(run.dataset.broken.reasons.items())):
         run.dataset.broken.record(name, reason)
     config, space = run.config.validation, run.dataset.spaces.action
     moves = gather_starts(moves, run.accelerator.device)
-    missing = len(chosen) - len({(move.episode_id, move.first_step) for move in moves})
+    missing = len(ranking_clips) - len({(move.episode_id, move.first_step) for move in moves})
     replacements = (
-        [window for window, name in zip(windows, names, strict=True) if name not in chosen] if missing else []
+        [window for window, name in zip(windows, names, strict=True) if name not in ranking_clips] if missing else []
     )
     for batch in islice(read_batches(run.dataset, replacements, batch_size=1, allow_empty=True), missing):
         moves += select_moves(encode(run, batch), 0, space, RANKING_REACH_CM / 100)
@@ -151,17 +151,17 @@ def _measure(run: Run) -> Validation:
     return Validation(errors, rank_actions(run.world_model, moves, space, probes, seed=0))
 
 
-def _encoded(
-    run: Run, batches: Iterable[Batch], chosen: Container[tuple[str, int]], moves: list[RolloutStart]
+def _encode_batches(
+    run: Run, batches: Iterable[Batch], ranking_clips: Container[tuple[str, int]], moves: list[RolloutStart]
 ) -> Iterator[LatentBatch]:
-    """Yield the latents of batches, and append the moving steps of the clips in `chosen` to `moves`."""
+    """Yield the latents of batches, and append the moving steps of the clips in `ranking_clips` to `moves`."""
     for batch in batches:
         latents = encode(run, batch)
         if run.image_strip is not None:
             run.image_strip.update(run.dataset, batch, latents)
-        for row, name in enumerate(zip(latents.episode_ids, latents.starts, strict=True)):
-            if name in chosen:
-                moves += select_moves(latents, row, run.dataset.spaces.action, RANKING_REACH_CM / 100)
+        for index, name in enumerate(zip(latents.episode_ids, latents.starts, strict=True)):
+            if name in ranking_clips:
+                moves += select_moves(latents, index, run.dataset.spaces.action, RANKING_REACH_CM / 100)
         yield latents
 
 
