@@ -74,7 +74,7 @@ def test_vectors_need_finite_numbers_and_at_least_one_step() -> None:
 
 
 @pytest.mark.parametrize(
-    ("knobs", "widths", "follows"),
+    ("knobs", "widths", "effect"),
     [
         ({}, Widths(8, 8), "change"),
         ({"actions": "recorded", "join_actions": "sum"}, Widths(8, 8), "change"),
@@ -85,9 +85,9 @@ def test_vectors_need_finite_numbers_and_at_least_one_step() -> None:
         ({"actions": "recorded", "join_actions": "sum"}, Widths(8, 7), "unknown"),
     ],
 )
-def test_action_semantics_follow_the_config(knobs: dict[str, object], widths: Widths, follows: str) -> None:
+def test_action_semantics_follow_the_config(knobs: dict[str, object], widths: Widths, effect: str) -> None:
     spaces = get_spaces(DataConfig(path="d", source="npz", states="vector", **knobs), widths)
-    assert (spaces.action.follows, spaces.widths) == (follows, widths)
+    assert (spaces.action.effect, spaces.widths) == (effect, widths)
 
 
 def test_pose_frame_is_the_config_frame_and_reading_uses_the_base_frame() -> None:

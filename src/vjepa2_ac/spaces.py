@@ -34,7 +34,7 @@ CONVERSIONS = {  # conversions from other units to metres and radians
 }
 _MAX_CM, _MAX_MM, _MAX_DEGREES = 100.0, 5000.0, 360.5  # of positions and angles that look like these units
 
-Follows = Literal["change", "target", "unknown"]
+ActionEffect = Literal["change", "target", "unknown"]
 
 
 # ---- poses, as NumPy arrays or tensors; rotations are subtracted as matrices, because Euler angles wrap at pi ----
@@ -288,11 +288,9 @@ class StateSpace(Space):
 
 @dataclass(frozen=True)
 class ActionSpace(Space):
-    """The numbers of an action, and how the next state follows from it."""
+    """The numbers of an action, and its effect on the state."""
 
-    follows: Follows = (
-        "change"  # change: added to the state. target: becomes the state. unknown: the effect on the state is unknown
-    )
+    effect: ActionEffect = "change"  # change: the action is added to the state; target: it is the next state
 
 
 def no_steps_error(where: str) -> InputError:
@@ -322,9 +320,9 @@ def require_finite(numbers: Float[np.ndarray, "steps dim"], where: str, *, fix: 
     make_vector_states(numbers.shape[1]).require_plausible(numbers, where, fix=fix)
 
 
-def make_vector_actions(width: int, follows: Follows) -> ActionSpace:
+def make_vector_actions(width: int, effect: ActionEffect) -> ActionSpace:
     """Return the space of actions whose numbers have no known meaning."""
-    return ActionSpace(tuple(f"action {number}" for number in range(width)), ("",) * width, follows=follows)
+    return ActionSpace(tuple(f"action {number}" for number in range(width)), ("",) * width, effect=effect)
 
 
 @dataclass(frozen=True)
@@ -348,9 +346,9 @@ class Spaces:
             joined: "difference" for differences of states; else how recorded actions were joined (`data.join_actions`):
                 "sum" of changes, or the "last" target state.
         """
-        meanings: dict[str | None, Follows] = {"difference": "change", "sum": "change", "last": "target"}
-        follows: Follows = meanings.get(joined, "unknown") if widths.state == widths.action else "unknown"
-        return cls(make_vector_states(widths.state), make_vector_actions(widths.action, follows))
+        effects: dict[str | None, ActionEffect] = {"difference": "change", "sum": "change", "last": "target"}
+        effect: ActionEffect = effects.get(joined, "unknown") if widths.state == widths.action else "unknown"
+        return cls(make_vector_states(widths.state), make_vector_actions(widths.action, effect))
 
 
 POSES = Spaces(POSE, POSE_CHANGE)

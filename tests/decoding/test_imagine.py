@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from decisions import asked, image
+from decisions import image, make_plan_result
 from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.data.transforms import crop_frames, to_display_frames
@@ -73,7 +73,7 @@ def decoder(tmp_path_factory: pytest.TempPathFactory) -> TrainedDecoder:
 
 
 def test_plan_images_are_the_decoded_rollout_of_its_actions(decoder: TrainedDecoder) -> None:
-    answer = asked(100, 101, nodes=0, horizon=3)
+    answer = make_plan_result(100, 101, nodes=0, horizon=3)
     found = imagine_plan(answer, decoder)
     plan, cost = answer.decision.plan, answer.decision.cost
     assert plan is not None
@@ -88,12 +88,12 @@ def test_plan_images_are_the_decoded_rollout_of_its_actions(decoder: TrainedDeco
 
 
 def test_long_plan_shows_eight_steps_including_the_last(decoder: TrainedDecoder) -> None:
-    steps = imagine_plan(asked(nodes=0, horizon=11), decoder).steps
+    steps = imagine_plan(make_plan_result(nodes=0, horizon=11), decoder).steps
     assert len(steps) == 8
     assert [min(steps), max(steps)] == [1, 11]
 
 
 @pytest.mark.parametrize("answer", [{"start": 100}, {"broken": True}])
 def test_no_images_without_a_plan_or_finite_predictions(decoder: TrainedDecoder, answer: dict) -> None:
-    answer = asked(nodes=0, **answer)
+    answer = make_plan_result(nodes=0, **answer)
     assert imagine_plan(answer, decoder).steps == {}

@@ -11,7 +11,7 @@ from torch import Tensor
 from vjepa2_ac.evaluation.action_use import RolloutStart, rollout_start
 from vjepa2_ac.inspection.axes import AxisFit, infer_axes
 from vjepa2_ac.intervals import Estimate
-from vjepa2_ac.planning.energy import Axes
+from vjepa2_ac.planning.energy import AxesRotation
 from worlds import TIME, Copier, Oracle, clips_batch
 
 CLIPS = 16
@@ -21,7 +21,7 @@ class Turned(Oracle):
     """Knows the world, but in axes of its own: it sees turned, and longer, what the robot does."""
 
     def __init__(self, degrees: float, gain: float = 1.0, *, mirrored: bool = False) -> None:
-        self.back, self.gain, self.side = Axes(-np.deg2rad(degrees)), gain, -1.0 if mirrored else 1.0
+        self.back, self.gain, self.side = AxesRotation(-np.deg2rad(degrees)), gain, -1.0 if mirrored else 1.0
 
     def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
         back = self.back.rotate_actions(actions) / torch.tensor([self.gain, self.side * self.gain, 1, 1, 1, 1, 1])
@@ -89,7 +89,7 @@ class Placed(Turned):
 def test_centre_of_the_rotation_is_recovered(about: str) -> None:
     """A mounting is turned about the base; a camera leaves what it looks at where it is."""
     there = torch.tensor([0.4, 0.1, 0.3, 0.0, 0.0, 0.0, 0.0])
-    expected = there if about == "middle" else Axes(np.deg2rad(45.0)).rotate_poses(there)
+    expected = there if about == "middle" else AxesRotation(np.deg2rad(45.0)).rotate_poses(there)
     begun = [replace(start, state=there) for start in starts()]
     found = infer_axes(Placed(45.0, expected[:3]), begun, at_once=64)
     assert found.yaw_degrees.value == pytest.approx(45.0, abs=0.5)

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from decisions import QUICK, STATE, image
-from decisions import controller as tiny_controller
+from decisions import make_controller as make_tiny_controller
 from tiny_models import tiny_model
 from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.errors import InputError
@@ -24,17 +24,17 @@ MOVED = STATE + np.eye(7)[1] * 0.0055
 BLACK = np.zeros_like(image(0))
 
 
-def controller() -> Controller:
-    run = tiny_controller()
-    run.reset(image(100))
-    return run
+def make_controller() -> Controller:
+    controller = make_tiny_controller()
+    controller.reset(image(100))
+    return controller
 
 
-def why(run: Controller, frame: np.ndarray, state: np.ndarray = STATE) -> str:
+def why(controller: Controller, frame: np.ndarray, state: np.ndarray = STATE) -> str:
     """Return the reason of a decision; check that the action is zero for a faulty frame."""
-    action = run.act(frame, state)
-    assert action.any() == (run.decision.why in {"planned", "as planned"})
-    return run.decision.why
+    action = controller.act(frame, state)
+    assert action.any() == (controller.decision.why in {"planned", "as planned"})
+    return controller.decision.why
 
 
 def covered_lens(noise: float, seed: int = 0) -> np.ndarray:
@@ -56,25 +56,26 @@ def test_covered_lens_with_noise_is_a_uniform_frame(noise: float) -> None:
     assert is_uniform(covered_lens(noise))
     for level in (0, 90, 255):
         assert is_uniform(np.full((180, 320, 3), level, np.uint8))
-    assert is_uniform(np.full((180, 320, 3), (0, 140, 30), np.uint8)), "a decoder that failed"
+    assert is_uniform(np.full((180, 320, 3), (0, 140, 30), np.uint8)), "the image of a failed decoder"
 
 
 def test_frozen_frame_gives_zero_actions_until_the_image_changes() -> None:
-    run = controller()
-    found = [
-        why(run, image(seed), state) for seed, state in ((0, STATE), (0, MOVED), (0, MOVED), (1, MOVED), (1, MOVED))
+    controller = make_controller()
+    reasons = [
+        why(controller, image(seed), state)
+        for seed, state in ((0, STATE), (0, MOVED), (0, MOVED), (1, MOVED), (1, MOVED))
     ]
-    assert found == ["planned", "frozen frame", "frozen frame", "planned", "planned"]
-    assert why(run, image(1), STATE) == "frozen frame"
-    run.reset(image(100))
-    assert why(run, image(1), STATE) == "planned", "a reset forgets"
+    assert reasons == ["planned", "frozen frame", "frozen frame", "planned", "planned"]
+    assert why(controller, image(1), STATE) == "frozen frame"
+    controller.reset(image(100))
+    assert why(controller, image(1), STATE) == "planned", "a reset removes the previous image"
 
 
 def test_reused_image_buffer_is_not_a_frozen_frame() -> None:
-    run, memory = controller(), image(0)
-    why(run, memory, STATE)
+    controller, memory = make_controller(), image(0)
+    why(controller, memory, STATE)
     memory[:] = image(1)
-    assert why(run, memory, MOVED) == "planned"
+    assert why(controller, memory, MOVED) == "planned"
 
 
 @pytest.mark.parametrize(
@@ -91,40 +92,42 @@ def test_pose_has_moved_above_half_a_centimetre_or_three_degrees(change: list[fl
 
 
 def test_fault_of_one_of_two_cameras_stops_the_robot() -> None:
-    run = tiny_controller(views=2)
+    controller = make_tiny_controller(views=2)
     two = lambda left, right: np.hstack([image(left, 48, 48) if left else BLACK[:48, :48], image(right, 48, 48)])  # noqa: E731
-    run.reset(two(100, 101))
-    assert why(run, two(1, 2)) == "planned"
-    assert why(run, two(1, 3), MOVED) == "frozen frame"
-    assert why(run, two(4, 5), MOVED) == "planned"
-    assert why(run, two(0, 6), MOVED) == "uniform frame"
+    controller.reset(two(100, 101))
+    assert why(controller, two(1, 2)) == "planned"
+    assert why(controller, two(1, 3), MOVED) == "frozen frame"
+    assert why(controller, two(4, 5), MOVED) == "planned"
+    assert why(controller, two(0, 6), MOVED) == "uniform frame"
     with pytest.raises(InputError, match="goal 0: an image without contrast"):
-        run.reset(two(0, 6))
+        controller.reset(two(0, 6))
 
 
 @pytest.mark.parametrize("crop", ["released", "square", "letterbox"])
 def test_contrast_check_uses_only_the_cropped_image(crop: Crop) -> None:
     wide = image(100, 48, 120)
-    run = Controller(tiny_model(), QUICK, crop=crop)
-    run.reset(wide)
+    controller = Controller(tiny_model(), QUICK, crop=crop)
+    controller.reset(wide)
     edge = np.full_like(wide, 128)
     edge[:, :20] = wide[:, :20]
-    assert why(run, edge) == ("planned" if crop == "letterbox" else "uniform frame")
-    assert why(run, np.full_like(wide, 128)) == "uniform frame", "bars are no contrast"
+    assert why(controller, edge) == ("planned" if crop == "letterbox" else "uniform frame")
+    assert why(controller, np.full_like(wide, 128)) == "uniform frame", "the bars of a letterbox are no contrast"
 
 
 def test_faulty_frame_does_not_advance_the_goal() -> None:
-    run = controller()
+    controller = make_controller()
     goals = [dataclasses.replace(goal, share=0.5) for goal in make_timed_goals([image(100), image(101)], [3])]
     goals[0] = dataclasses.replace(goals[0], at_least=1)
-    run.follow(goals)
-    assert why(run, BLACK) == "uniform frame"
-    assert (run.decision.goals, math.isnan(run.decision.current_energy)) == ((0, 0), True)
-    run.act(image(1), STATE)
-    began = run.decision.progress.initial_energy
-    assert began == pytest.approx(float((run.encode(image(1)) - run._goal_latents[0]).abs().mean()), rel=1e-5)
+    controller.follow(goals)
+    assert why(controller, BLACK) == "uniform frame"
+    assert (controller.decision.goals, math.isnan(controller.decision.current_energy)) == ((0, 0), True)
+    controller.act(image(1), STATE)
+    began = controller.decision.progress.initial_energy
+    assert began == pytest.approx(
+        float((controller.encode(image(1)) - controller._goal_latents[0]).abs().mean()), rel=1e-5
+    )
     for _ in range(4):
-        assert why(run, BLACK) == "uniform frame"
-        assert (run.decision.progress.goal_index, run.decision.progress.changed) == (0, "")
-    run.act(image(2), STATE)
-    assert run.decision.progress.goal_index == 1, "its steps are over"
+        assert why(controller, BLACK) == "uniform frame"
+        assert (controller.decision.progress.goal_index, controller.decision.progress.changed) == (0, "")
+    controller.act(image(2), STATE)
+    assert controller.decision.progress.goal_index == 1, "the goal's steps have elapsed"

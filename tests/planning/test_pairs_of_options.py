@@ -35,7 +35,7 @@ def planner(name: str, **options: Any) -> dict[str, Any]:
 
 SIDE = 16  # pixels of a view: the model scales every image
 BASE: dict[str, Any] = {"horizon": 2, "samples": 4, "iterations": 1, "planner": planner("cem")}
-# For every key, a value other than the default and that of BASE, with the keys that it requires.
+# For each key, a value that is neither the default nor that of BASE, with the keys that it requires.
 OTHERS: dict[str, Any] = {
     "planner": {"planner": planner("icem")},
     "horizon": 4,
@@ -78,7 +78,7 @@ MORE: dict[str, Any] = {
     "mask": {},
     "samples of a policy": {},
 }
-# Options that skip parts of a decision: their pairs are tested separately, and other pairs in groups.
+# Options that skip parts of a decision. Each of their pairs is tested alone; all other pairs are tested in groups.
 ALONE = {"budget_s", "samples of a policy"}
 REFUSED = {
     *(frozenset({"views", other}) for other in ("axes", "prior", "planner=prior", "monitor")),
@@ -96,7 +96,7 @@ class Scene:
     def planning(self, *names: str) -> dict[str, Any]:
         """Return the values of some options, with the keys that they require."""
         planning: dict[str, Any] = {}
-        for key, value in [*BASE.items(), *(pair for name in names for pair in entries(name).items())]:
+        for key, value in [*BASE.items(), *(pair for name in names for pair in get_entries(name).items())]:
             section, _, inner = key.rpartition(".")
             (planning.setdefault(section, {}) if section else planning)[inner] = self.files.get(str(value), value)
         return planning
@@ -108,7 +108,7 @@ class Scene:
             InputError: The options exclude each other.
         """
         planning = self.planning(*names)
-        try:  # quick
+        try:  # faster than parse_config, which gives the error message
             update = {"planning": PlanningConfig.model_validate_json(json.dumps(planning))}
             return CONFIG.model_copy(update=update)
         except ValidationError:
@@ -119,7 +119,7 @@ VALUES = {"run_dir": "r", "data": {"path": "d", "stride": 4}, "model": {"base": 
 CONFIG = parse_config(VALUES, where="test")
 
 
-def entries(name: str) -> dict[str, Any]:
+def get_entries(name: str) -> dict[str, Any]:
     value = (OTHERS | MORE)[name]
     return value if isinstance(value, dict) else {name: value}
 
@@ -127,15 +127,19 @@ def entries(name: str) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     folder, model = tmp_path_factory.mktemp("files"), tiny_model(depth=1)
-    known = model.merged_from = model.fingerprints()  # hashed once
-    monitor = Monitor("vjepa2-ac monitor 1", 1e6, 0.1, 8, (1.0,), (0.0,) * TOKENS, known.encoder, known.predictor)
+    fingerprints = model.merged_from = model.fingerprints()  # hashed once
+    monitor = Monitor(
+        "vjepa2-ac monitor 1", 1e6, 0.1, 8, (1.0,), (0.0,) * TOKENS, fingerprints.encoder, fingerprints.predictor
+    )
     (folder / "monitor.json").write_text(json.dumps(asdict(monitor)))
-    whose = {"subject": "tiny", "encoder": known.encoder, "predictor": known.predictor}
-    axes = {"format": 1, "yaw_degrees": {"value": 43.0}, "problem": None, "model": whose}
+    model_record = {"subject": "tiny", "encoder": fingerprints.encoder, "predictor": fingerprints.predictor}
+    axes = {"format": 1, "yaw_degrees": {"value": 43.0}, "problem": None, "model": model_record}
     (folder / "axes.json").write_text(json.dumps(axes))
     sizes = PriorSizes(grid=3, dim=DIM, state=7, action=7, ahead=3)
     save_prior(
-        folder / "prior", PriorCard("vjepa2-ac prior 1", sizes, known.encoder, "released", "", 0), ActionPrior(sizes)
+        folder / "prior",
+        PriorCard("vjepa2-ac prior 1", sizes, fingerprints.encoder, "released", "", 0),
+        ActionPrior(sizes),
     )
     files = {"MONITOR": "monitor.json", "AXES": "axes.json", "PRIOR": "prior"}
     with pytest.MonkeyPatch.context() as patched:
@@ -162,42 +166,42 @@ def plan_with_options(scene: Scene, *names: str) -> None:
 
 def test_every_option_is_varied(scene: Scene) -> None:
     keys = {key.removeprefix("planning.") for key in collect_effects(Config) if key.startswith("planning.")}
-    assert set(OTHERS) == keys, "a new key needs another value here"
-    usual = scene.config()
+    assert set(OTHERS) == keys, "add a value for the new key to OTHERS"
+    default_config = scene.config()
     for name in OTHERS:
-        assert scene.config(name) != usual
+        assert scene.config(name) != default_config
 
 
 def test_every_pair_of_options_works_or_raises_before_the_first_decision(scene: Scene) -> None:
-    refused, together = set(), {name: set[str]() for name in OTHERS | MORE}
+    refused, compatible = set(), {name: set[str]() for name in OTHERS | MORE}
     for one, other in combinations(OTHERS | MORE, 2):
-        shared = entries(one).keys() & entries(other).keys()
-        if any(entries(one)[key] != entries(other)[key] for key in shared):
+        shared = get_entries(one).keys() & get_entries(other).keys()
+        if any(get_entries(one)[key] != get_entries(other)[key] for key in shared):
             continue  # two values of one option
         try:
             scene.config(one, other)
         except InputError:
             refused.add(frozenset({one, other}))
             continue
-        together[one].add(other)
-        together[other].add(one)
+        compatible[one].add(other)
+        compatible[other].add(one)
     assert refused == REFUSED
-    pairs = [frozenset(pair) for pair in combinations(together, 2) if pair[1] in together[pair[0]]]
+    pairs = [frozenset(pair) for pair in combinations(compatible, 2) if pair[1] in compatible[pair[0]]]
     alone = [sorted(pair) for pair in pairs if pair & ALONE]
-    for names in [*alone, *covering([pair for pair in pairs if not pair & ALONE], together)]:
+    for names in [*alone, *group_pairs([pair for pair in pairs if not pair & ALONE], compatible)]:
         try:
             plan_with_options(scene, *names)
         except Exception as error:
             raise AssertionError(f"{', '.join(names)}: {scene.planning(*names)}") from error
 
 
-def covering(left: list[frozenset[str]], together: dict[str, set[str]], at_most: int = 8) -> Iterator[list[str]]:
-    """Yield groups of compatible options that cover these pairs."""
-    while left:
-        group = sorted(left[0])
-        names = {name for pair in left for name in pair}
-        for name in sorted(names, key=lambda name: (-sum({name, one} in left for one in group), name)):
-            if len(group) < at_most and all(name in together[one] for one in group):
+def group_pairs(pairs: list[frozenset[str]], compatible: dict[str, set[str]], at_most: int = 8) -> Iterator[list[str]]:
+    """Yield groups of compatible options that contain all pairs."""
+    while pairs:
+        group = sorted(pairs[0])
+        names = {name for pair in pairs for name in pair}
+        for name in sorted(names, key=lambda name: (-sum({name, one} in pairs for one in group), name)):
+            if len(group) < at_most and all(name in compatible[one] for one in group):
                 group.append(name)
-        left = [pair for pair in left if not pair <= {*group}]
+        pairs = [pair for pair in pairs if not pair <= {*group}]
         yield group

@@ -45,17 +45,17 @@ def prediction(world_model: WorldModel) -> torch.Tensor:
 
 
 def test_run_plans_with_its_own_config(run: Path) -> None:
-    steering = load_for_planning(str(run))
-    assert steering.chosen == "step-00000010 (the best by error)"
-    assert steering.config.planning.horizon == 2
-    controller = Controller.of_subject(steering)
+    subject = load_for_planning(str(run))
+    assert subject.chosen == "step-00000010 (the best by error)"
+    assert subject.config.planning.horizon == 2
+    controller = Controller.of_subject(subject)
     images = np.random.default_rng(0).integers(0, 256, (2, 40, 64, 3), dtype=np.uint8)
     controller.reset(images[0])
     controller.act(images[1], STATE)
     assert controller.decision.plan.seed == 7
     assert len(controller.decision.plan.actions) == 2
     assert controller.crop == "square"
-    assert Controller.of_subject(steering, seed=3).seed == 3
+    assert Controller.of_subject(subject, seed=3).seed == 3
 
 
 def test_named_checkpoint_is_used_for_planning(run: Path, base_folder: Path) -> None:
@@ -71,7 +71,7 @@ def test_named_checkpoint_is_used_for_planning(run: Path, base_folder: Path) -> 
 def test_model_plans_with_and_without_a_config(make_config, base_folder: Path, tmp_path: Path) -> None:
     alone = load_for_planning(str(base_folder), overrides=["planning.samples=20", "seed=4"])
     assert (alone.config.planning.samples, alone.config.seed, alone.config.planning.horizon) == (20, 4, 1)
-    path = tmp_path / "its.yaml"
+    path = tmp_path / "model.yaml"
     path.write_text(config_as_yaml(make_config(planning=PLANNING, model__dtype="bfloat16", training__precision="bf16")))
     reported = load_for_planning(str(base_folder), config=path, overrides=["planning.planner.options.elites=3"])
     assert (reported.config.planning.horizon, reported.config.planning.planner.options) == (2, {"elites": 3})
@@ -119,8 +119,8 @@ def test_vector_run_plans_within_the_motions_of_its_data(make_config, reporter) 
     assert np.abs(limited.act(image(1), states[0][0])).max() <= 0.01
     with pytest.raises(InputError, match=r"state: 7 numbers .* Expected 8: state 0, state 1"):
         limited.act(image(1), np.zeros(7))
-    for spoiled, complaint in (('{"changes": [1.0, "far"]}', "one number of 0 or more"), ('{"changes": 3}', "found|3")):
-        (folder / "changes.json").write_text(spoiled)
+    for content, complaint in (('{"changes": [1.0, "far"]}', "one number of 0 or more"), ('{"changes": 3}', "found|3")):
+        (folder / "changes.json").write_text(content)
         with pytest.raises(InputError, match=complaint):
             load_for_planning(str(folder))
     (folder / "changes.json").unlink()
@@ -148,12 +148,12 @@ def test_merged_run_has_the_dtype_of_its_base_and_fingerprints_of_the_trained_we
 ) -> None:
     config = make_config(adapter=adapter, model__dtype="bfloat16", training__precision="bf16")
     run = write_adapted_run(config)
-    steering, trained = load_for_planning(str(run), checkpoint="newest"), load_subject(run, "newest").world_model
-    assert type(steering.world_model.predictor) is ActionConditionedPredictor
-    assert steering.world_model.adaptation is None
-    assert {value.dtype for value in steering.world_model.parameters()} == {torch.bfloat16}
-    torch.testing.assert_close(prediction(steering.world_model), prediction(trained.eval()), rtol=0, atol=0.1)
-    reported = steering.as_dict()["model"]
+    subject, trained = load_for_planning(str(run), checkpoint="newest"), load_subject(run, "newest").world_model
+    assert type(subject.world_model.predictor) is ActionConditionedPredictor
+    assert subject.world_model.adaptation is None
+    assert {value.dtype for value in subject.world_model.parameters()} == {torch.bfloat16}
+    torch.testing.assert_close(prediction(subject.world_model), prediction(trained.eval()), rtol=0, atol=0.1)
+    reported = subject.as_dict()["model"]
     assert reported["encoder"] == trained.encoder_fingerprint()
     assert reported["base"] == load_base(config.model, seed=0).predictor_fingerprint()
     assert reported["predictor"] == fingerprint(trained.predictor.state_dict())
@@ -183,30 +183,30 @@ def read_warnings(folder: Path, *overrides: str) -> tuple[str, ...]:
 
 def test_pose_run_records_data_limits_and_plans_within_them(make_config, reporter) -> None:
     folder = train(make_config(planning=PLANNING, training__steps=1), reporter)
-    noted = json.loads((folder / "changes.json").read_text())
+    recorded = json.loads((folder / "changes.json").read_text())
     source = open_source(read_run_config(folder).data)
     states = [source.read(number).states for number in range(len(source.infos()))]
-    pieces = [one[first::2] for one in states for first in (0, 1)]
-    expected = np.percentile(np.abs(np.concatenate([actions_from_states(one) for one in pieces])), 99, axis=0)
-    np.testing.assert_allclose(noted["changes"], expected, atol=1e-9)
-    assert noted["percentile"] == 99
-    session = load_for_planning(
+    strided_states = [one[first::2] for one in states for first in (0, 1)]
+    expected = np.percentile(np.abs(np.concatenate([actions_from_states(one) for one in strided_states])), 99, axis=0)
+    np.testing.assert_allclose(recorded["changes"], expected, atol=1e-9)
+    assert recorded["percentile"] == 99
+    subject = load_for_planning(
         str(folder), overrides=["planning.limits.xyz=data", "planning.limits.gripper_mode=held"]
     )
-    limits = session.config.planning.limits.xyz
-    assert (np.array(noted["changes"][:3]) - limits < 1e-4).all()
-    assert not any("planning.limits" in warning for warning in session.warnings)
-    controller = Controller.of_subject(session)
+    limits = subject.config.planning.limits.xyz
+    assert (np.array(recorded["changes"][:3]) - limits < 1e-4).all()
+    assert not any("planning.limits" in warning for warning in subject.warnings)
+    controller = Controller.of_subject(subject)
     controller.reset(image(0))
     action = controller.act(image(1), states[0][0])
     assert np.any(action)
-    assert (np.abs(action[:3]) <= noted["changes"][:3]).all()
+    assert (np.abs(action[:3]) <= recorded["changes"][:3]).all()
 
     data_changes = PlanningConfig.model_validate({**PLANNING, "limits": {"xyz": "data"}})
     of_run = Controller.of_run(load_subject(folder), data_changes)
     np.testing.assert_allclose(of_run.space.upper[0, :3], limits, rtol=1e-6)
-    asked = EvaluationOptions(overrides=("planning.limits.xyz=data",))
-    assert resolve_config(str(folder), asked).planning.limits.xyz == limits
+    options = EvaluationOptions(overrides=("planning.limits.xyz=data",))
+    assert resolve_config(str(folder), options).planning.limits.xyz == limits
 
 
 def test_run_without_recorded_motions_plans_but_rejects_data_limits(make_config, base_folder) -> None:
@@ -224,13 +224,13 @@ def test_run_without_recorded_motions_plans_but_rejects_data_limits(make_config,
 def test_limits_beyond_the_training_data_are_logged_as_warnings(
     run_with_data_limits: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    session = load_for_planning(str(run_with_data_limits), overrides=["planning.limits.xyz=[0.05,0.02,0.012]"])
-    assert len(session.warnings) == 1
-    assert "planning.limits.xyz exceeds the motions in the training data of" in session.warnings[0]
-    assert "dx 5 (3) cm, dz 1.2 (1) cm (99th percentile" in session.warnings[0]
-    assert "Set planning.limits.xyz=data" in session.warnings[0]
-    assert session.as_dict()["warnings"] == list(session.warnings)
-    assert [(one.levelno, one.getMessage()) for one in caplog.records] == [(logging.WARNING, session.warnings[0])]
+    subject = load_for_planning(str(run_with_data_limits), overrides=["planning.limits.xyz=[0.05,0.02,0.012]"])
+    assert len(subject.warnings) == 1
+    assert "planning.limits.xyz exceeds the motions in the training data of" in subject.warnings[0]
+    assert "dx 5 (3) cm, dz 1.2 (1) cm (99th percentile" in subject.warnings[0]
+    assert "Set planning.limits.xyz=data" in subject.warnings[0]
+    assert subject.as_dict()["warnings"] == list(subject.warnings)
+    assert [(one.levelno, one.getMessage()) for one in caplog.records] == [(logging.WARNING, subject.warnings[0])]
     caplog.clear()
     Controller.of_run(load_subject(run_with_data_limits))
     assert "dx 5 (3) cm, dy 5 (2) cm, dz 5 (1) cm" in caplog.text
@@ -268,13 +268,13 @@ def test_vector_limits_are_compared_by_component(make_config) -> None:
     folder.mkdir()
     write_changes(folder, changes=[0.1, 0.02], narrow="1 of 2 numbers hardly move, 0 only one way")
 
-    def found(axes: tuple[float, ...]) -> tuple[str, ...]:
+    def compute_warnings(axes: tuple[float, ...]) -> tuple[str, ...]:
         limits = config.planning.limits.model_copy(update={"axes": axes})
         planning = config.planning.model_copy(update={"limits": limits})
         return warn_if_limits_exceed_data(config.model_copy(update={"planning": planning}), folder)
 
-    assert found((0.1, 0.02)) == (
+    assert compute_warnings((0.1, 0.02)) == (
         f"{folder} was trained on low-diversity data: 1 of 2 numbers hardly move, 0 only one way",
     )
-    assert "planning.limits.axes exceeds" in found((0.1,))[1]
-    assert "state 1 0.1 (0.02) (99th percentile" in found((0.1,))[1]
+    assert "planning.limits.axes exceeds" in compute_warnings((0.1,))[1]
+    assert "state 1 0.1 (0.02) (99th percentile" in compute_warnings((0.1,))[1]

@@ -34,15 +34,17 @@ def config(
     planner: str, iterations: int = 30, samples: int = 200, options: dict[str, Any] | None = None, **changes: Any
 ) -> PlanningConfig:
     """Return settings that suffice to optimise a few numbers."""
-    usual = {"gradient": {"starts": 16, "learning_rate": 0.1}, "mppi": {"std_decay": 0.85}}.get(planner, {})
-    component = {"name": planner, "options": options or usual}
+    default_options = {"gradient": {"starts": 16, "learning_rate": 0.1}, "mppi": {"std_decay": 0.85}}.get(planner, {})
+    component = {"name": planner, "options": options or default_options}
     return PlanningConfig(planner=component, iterations=iterations, samples=samples, **changes)
 
 
-def solve(planner: str, cost: Callable[[Tensor], Tensor], where: SearchSpace, seed: int = 0, **changes: Any) -> Plan:
+def solve(
+    planner: str, cost: Callable[[Tensor], Tensor], search_space: SearchSpace, seed: int = 0, **changes: Any
+) -> Plan:
     """Return the plan of least cost in a space."""
     generator = torch.Generator().manual_seed(seed)
-    return Planner(config(planner, **changes), where).plan(cost, generator)
+    return Planner(config(planner, **changes), search_space).plan(cost, generator)
 
 
 def parabola(target: Tensor) -> Callable[[Tensor], Tensor]:
@@ -80,8 +82,10 @@ def upstream_cost(actions: Tensor) -> Tensor:
 def test_cem_equals_the_upstream_plan_for_the_same_seed(case: dict) -> None:
     given = case["arguments"]
     closing = given.get("close_gripper")
-    usual = {"momentum_mean": 0.25, "momentum_std": 0.95}
-    cem = {"elites": given["topk"], **usual} | {name: given[name] for name in given if name.startswith("momentum")}
+    default_options = {"momentum_mean": 0.25, "momentum_std": 0.95}
+    cem = {"elites": given["topk"], **default_options} | {
+        name: given[name] for name in given if name.startswith("momentum")
+    }
     settings = PlanningConfig(
         horizon=given["rollout"],
         samples=given["samples"],
@@ -89,10 +93,10 @@ def test_cem_equals_the_upstream_plan_for_the_same_seed(case: dict) -> None:
         limits=LimitsConfig(xyz=(given.get("maxnorm", 0.05),) * 3),
         planner={"name": "cem", "options": cem},
     )
-    where = make_pose_search_space(settings)
+    search_space = make_pose_search_space(settings)
     if closing is not None:
-        where.lower[closing:, GRIPPER] = where.upper[closing:, GRIPPER] = 1.0
-    plan = Planner(settings, where).plan(upstream_cost, torch.Generator().manual_seed(case["seed"]))
+        search_space.lower[closing:, GRIPPER] = search_space.upper[closing:, GRIPPER] = 1.0
+    plan = Planner(settings, search_space).plan(upstream_cost, torch.Generator().manual_seed(case["seed"]))
     expected = torch.tensor(case["actions"])
     if closing is not None:  # upstream's value is a mean that is still approaching 1
         expected[closing:, 6] = 1.0
@@ -102,8 +106,8 @@ def test_cem_equals_the_upstream_plan_for_the_same_seed(case: dict) -> None:
 def jepa_wms_cost(actions: Tensor) -> Tensor:
     """Return the energies of the world in which JEPA-WMs' planner was run (golden/DATA_ORIGIN.md)."""
     goal = torch.tensor([0.12, -0.05, 0.3, 0.02, 0.0, -0.04, 0.6])
-    far = (actions.sum(dim=1) - goal).square().sum(dim=-1)
-    return far + 0.1 * (actions[:, 0, 0] * actions[:, 1, 1]).abs() + 0.05 * actions[:, :, 3].square().sum(dim=1)
+    distance = (actions.sum(dim=1) - goal).square().sum(dim=-1)
+    return distance + 0.1 * (actions[:, 0, 0] * actions[:, 1, 1]).abs() + 0.05 * actions[:, :, 3].square().sum(dim=1)
 
 
 @pytest.mark.parametrize("case", json.loads((GOLDEN / "cem_jepa_wms.json").read_text()), ids=lambda c: str(c["seed"]))
@@ -116,9 +120,9 @@ def test_cem_with_jepa_wms_settings_equals_its_plan(case: dict) -> None:
         iterations=15,
         limits=LimitsConfig(xyz=(0.1, 0.1, 0.1), rotation=0.1, gripper=0.75, gripper_mode="free"),
     )
-    where = make_pose_search_space(settings)
-    where.std[:, GRIPPER] = 0.1
-    plan = Planner(settings, where).plan(jepa_wms_cost, torch.Generator().manual_seed(case["seed"]))
+    search_space = make_pose_search_space(settings)
+    search_space.std[:, GRIPPER] = 0.1
+    plan = Planner(settings, search_space).plan(jepa_wms_cost, torch.Generator().manual_seed(case["seed"]))
     torch.testing.assert_close([one.lowest for one in plan.iterations], case["losses"], rtol=1e-3, atol=1e-7)
     torch.testing.assert_close(plan.actions, torch.tensor(case["actions"]), atol=1e-5, rtol=1e-3)
 
@@ -132,9 +136,9 @@ def test_the_same_seed_gives_the_same_plan_and_another_seed_another(planner: str
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-@pytest.mark.parametrize("says", [math.nan, math.inf, -math.inf])
-def test_no_finite_energy_gives_zero_actions(planner: str, says: float) -> None:
-    plan = solve(planner, lambda actions: actions.sum(dim=(1, 2)) * 0 + says, space(2), iterations=3)
+@pytest.mark.parametrize("energy", [math.nan, math.inf, -math.inf])
+def test_no_finite_energy_gives_zero_actions(planner: str, energy: float) -> None:
+    plan = solve(planner, lambda actions: actions.sum(dim=(1, 2)) * 0 + energy, space(2), iterations=3)
     assert not plan.actions.any()
     assert plan.stopped == "no finite energy"
     assert math.isnan(plan.energy)
@@ -180,14 +184,14 @@ class FakeClock:
 @pytest.mark.parametrize("planner", PLANNERS)
 @pytest.mark.parametrize(("budget", "iterations"), [(0.1, 1), (2.9, 2), (3.0, 3), (99.0, 5)])
 def test_iterations_stop_before_the_time_budget_is_exceeded(planner: str, budget: float, iterations: int) -> None:
-    watch = FakeClock()
+    clock = FakeClock()
 
     def slow(actions: Tensor) -> Tensor:
-        watch.time += 1.0 if len(actions) > 1 else 0.0
+        clock.time += 1.0 if len(actions) > 1 else 0.0
         return parabola(torch.zeros(1, 2))(actions)
 
     settings = config(planner, iterations=5, budget_s=budget)
-    plan = Planner(settings, space(), clock=watch).plan(slow, torch.Generator())
+    plan = Planner(settings, space(), clock=clock).plan(slow, torch.Generator())
     assert len(plan.iterations) == iterations
     assert plan.stopped == ("finished" if iterations == 5 else "out of time")
     assert plan.seconds == iterations
@@ -230,14 +234,14 @@ def test_icem_reuses_elites() -> None:
 
 def test_mppi_evaluates_its_mean_and_weights_by_energy() -> None:
     options = MppiSolver.Config(temperature=0.5, std_decay=0.5)
-    search = MppiSolver(space(), config("mppi", samples=3), torch.Generator(), options=options)
-    assert torch.equal(search.sample()[0], search.mean)
-    tried = torch.tensor([[[0.0, 0.0]], [[1.0, 0.0]], [[0.0, 1.0]]])
+    solver = MppiSolver(space(), config("mppi", samples=3), torch.Generator(), options=options)
+    assert torch.equal(solver.sample()[0], solver.mean)
+    samples = torch.tensor([[[0.0, 0.0]], [[1.0, 0.0]], [[0.0, 1.0]]])
     energies = torch.tensor([1.0, 3.0, 2.0])
-    search.update(EvaluatedPlans(tried, energies))
+    solver.update(EvaluatedPlans(samples, energies))
     weights = torch.exp(-energies / (0.5 * (2 / 3) ** 0.5))
-    torch.testing.assert_close(search.mean, (weights[1:] / weights.sum())[None])
-    torch.testing.assert_close(search.std, torch.full((1, 2), 0.5))
+    torch.testing.assert_close(solver.mean, (weights[1:] / weights.sum())[None])
+    torch.testing.assert_close(solver.std, torch.full((1, 2), 0.5))
 
 
 @pytest.mark.parametrize("decisions", [1, 2, 7, 8])

@@ -45,31 +45,31 @@ def trained_model(adapter: AdapterConfig, dtype: torch.dtype = torch.float32) ->
 
 def decide(model: WorldModel, config: PlanningConfig = PLAIN) -> list[np.ndarray]:
     images = np.random.default_rng(0).integers(0, 256, (3, 48, 48, 3), dtype=np.uint8)
-    run = Controller(model, config)
-    run.reset(images[0])
-    return [run.act(image, STATE) for image in images[1:]]
+    planning_controller = Controller(model, config)
+    planning_controller.reset(images[0])
+    return [planning_controller.act(image, STATE) for image in images[1:]]
 
 
 @every_adapter
 def test_merged_model_decides_like_the_trained_model(adapter: AdapterConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, tried = trained_model(adapter), actions(20, 2)
+    model, samples = trained_model(adapter), actions(20, 2)
     with torch.no_grad():
-        expected, of_base = cost(model)(tried), cost(tiny_model())(tried)
-        torch.testing.assert_close(cost(prepare_for_planning(model, PLAIN))(tried), expected, rtol=1e-5, atol=0)
-    assert (expected - of_base).norm() > 1e-3 * of_base.norm(), "training changed something"
-    found = decide(model)
+        expected, base_energies = cost(model)(samples), cost(tiny_model())(samples)
+        torch.testing.assert_close(cost(prepare_for_planning(model, PLAIN))(samples), expected, rtol=1e-5, atol=0)
+    assert (expected - base_energies).norm() > 1e-3 * base_energies.norm(), "the trained weights change the energies"
+    actual = decide(model)
     monkeypatch.setattr(controller, "prepare_for_planning", lambda given, _: given)
-    np.testing.assert_allclose(found, decide(model), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(actual, decide(model), rtol=0, atol=1e-5)
 
 
 @every_adapter
 @torch.no_grad()
 def test_bfloat16_energies_equal_float32_up_to_rounding(adapter: AdapterConfig) -> None:
-    model, tried = trained_model(adapter, torch.bfloat16), actions(50, 2)
+    model, samples = trained_model(adapter, torch.bfloat16), actions(50, 2)
     precise, base = copy.deepcopy(model).float(), tiny_model().to(torch.bfloat16)
-    exact, of_base = cost(precise)(tried), cost(copy.deepcopy(base).float())(tried)
-    rounding = (cost(base)(tried) - of_base).norm() / of_base.norm()  # of an untrained model
-    error = (cost(prepare_for_planning(model, PLAIN))(tried) - exact).norm() / exact.norm()
+    exact, base_energies = cost(precise)(samples), cost(copy.deepcopy(base).float())(samples)
+    rounding = (cost(base)(samples) - base_energies).norm() / base_energies.norm()  # for the base model
+    error = (cost(prepare_for_planning(model, PLAIN))(samples) - exact).norm() / exact.norm()
     assert error < 2 * rounding < 0.01
 
 
@@ -79,11 +79,11 @@ def test_controller_leaves_the_model_unchanged(adapter: AdapterConfig) -> None:
     weights = {name: value.clone() for name, value in model.state_dict().items()}
     trained = [value.requires_grad for value in model.parameters()]
     adaptation, predictor = model.adaptation, model.predictor
-    ready = prepare_for_planning(model, PLAIN)
-    assert ready.encoder is model.encoder
-    assert ready.adaptation is None
-    assert not any(part.training for part in ready.modules())
-    assert {value.dtype for value in ready.parameters()} == {torch.bfloat16}
+    prepared = prepare_for_planning(model, PLAIN)
+    assert prepared.encoder is model.encoder
+    assert prepared.adaptation is None
+    assert not any(part.training for part in prepared.modules())
+    assert {value.dtype for value in prepared.parameters()} == {torch.bfloat16}
     assert model.predictor is predictor
     assert model.predictor.training
     assert model.adaptation is adaptation
@@ -110,10 +110,10 @@ def test_compiled_plans_equal_uncompiled_plans(adapted: bool, planner: str) -> N
     model, planned = tiny_model(adapted=adapted), {"planner": Component(planner)}
     expected = decide(model, IN_PARTS.model_copy(update=planned))
     assert not counters["stats"]
-    found = decide(model, COMPILED.model_copy(update=planned))
+    actual = decide(model, COMPILED.model_copy(update=planned))
     assert counters["stats"]["unique_graphs"]
     assert not counters["graph_break"]
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
 def test_missing_compiler_raises(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from decisions import STATE, controller, image
+from decisions import STATE, image, make_controller
 from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.config import RldsData
@@ -24,15 +24,15 @@ from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
 
 
 def decide(goal: np.ndarray, frame: np.ndarray, views: int, mask: np.ndarray | None = None) -> Controller:
-    run = controller(views=views, limits=LimitsConfig(rotation=0.1))
-    run.reset(goal, mask=mask)
-    run.act(frame, STATE)
-    return run
+    controller = make_controller(views=views, limits=LimitsConfig(rotation=0.1))
+    controller.reset(goal, mask=mask)
+    controller.act(frame, STATE)
+    return controller
 
 
-def energies(run: Controller, actions: torch.Tensor) -> torch.Tensor:
+def energies(controller: Controller, actions: torch.Tensor) -> torch.Tensor:
     with torch.no_grad():
-        return run.decision.cost(actions)
+        return controller.decision.cost(actions)
 
 
 def test_energy_of_two_views_is_the_mean_of_both() -> None:
@@ -44,9 +44,9 @@ def test_energy_of_two_views_is_the_mean_of_both() -> None:
     predicted, states = both.decision.cost.rollout(actions)
     tokens = tiny_model().num_tokens
     for number, (goal, frame) in enumerate(zip(goals, frames, strict=True)):
-        of_one, the_same = decide(goal, frame, 1).decision.cost.rollout(actions)
-        torch.testing.assert_close(predicted[:, :, number * tokens : (number + 1) * tokens], of_one)
-        torch.testing.assert_close(states, the_same)
+        single_view, single_states = decide(goal, frame, 1).decision.cost.rollout(actions)
+        torch.testing.assert_close(predicted[:, :, number * tokens : (number + 1) * tokens], single_view)
+        torch.testing.assert_close(states, single_states)
 
 
 def test_mask_can_exclude_one_view() -> None:
@@ -70,8 +70,8 @@ def test_goals_and_video_contain_both_cameras(tmp_path: Path) -> None:
     data = tmp_path / "data"
     record_dataset(data, RecordingSpec("A", 9, seed=0, cameras=2), episodes=2)
     config = RldsData(path=str(data), camera=("exterior_1_left", "exterior_2_left"))
-    found = [make_goals(config, "0", KeyFrameOptions(every=4, views=views)) for views in (1, 2)]
-    one, both = (np.stack([made.first, made.goals[0].image]) for made in found)
+    actual = [make_goals(config, "0", KeyFrameOptions(every=4, views=views)) for views in (1, 2)]
+    one, both = (np.stack([made.first, made.goals[0].image]) for made in actual)
     np.testing.assert_array_equal(both[:, :, : both.shape[2] // 2], one)
     assert (both[:, :, both.shape[2] // 2 :] != one).any()
     with pytest.raises(InputError, match=r"data.camera: exterior_1_left. Expected 2 cameras"):
@@ -87,12 +87,12 @@ def test_image_of_two_views_is_predicted_by_view(tmp_path: Path) -> None:
     model, values = tiny_model(), {"run_dir": "r", "data": {"path": "d", "stride": 4}, "model": {"base": "b"}}
     decoder, images = str(write_decoder(tmp_path / "decoder", model)), [image(1), image(2)]
 
-    def film(pixels: np.ndarray, views: int) -> np.ndarray:
+    def predict_frames(pixels: np.ndarray, views: int) -> np.ndarray:
         config = parse_config(values | {"planning": {"views": views}}, where="test")
         session = Subject("tiny", config, model)
-        found = imagine_image(session, ImagineOptions(decoder, ("up",), steps=2), ImageObservation(pixels, STATE))
-        return np.concatenate([found.first[None], found.decoded_first[None], found.rollouts[0].frames])
+        actual = imagine_image(session, ImagineOptions(decoder, ("up",), steps=2), ImageObservation(pixels, STATE))
+        return np.concatenate([actual.first[None], actual.decoded_first[None], actual.rollouts[0].frames])
 
-    both = film(np.hstack(images), 2)
-    alone = np.concatenate([film(one, 1) for one in images], axis=2)
+    both = predict_frames(np.hstack(images), 2)
+    alone = np.concatenate([predict_frames(pixels, 1) for pixels in images], axis=2)
     assert np.abs(both.astype(int) - alone).max() <= 1

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pydantic import ValidationError
 
-from decisions import controller, image
+from decisions import image, make_controller
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_within_limits, make_pose_search_space
@@ -36,19 +36,21 @@ NEAR = st.tuples(st.floats(0.27, 0.63), st.floats(-0.23, 0.23), st.floats(0.08, 
 
 
 @given(NEAR, arrays(np.float64, (3, 7), elements=st.floats(-1, 1)), st.none() | st.floats(0.02, 0.1))
-@example((0.27, 0.0, 0.3), np.array([[-1.0, 1, 0, 0, 0, 0, 0]] * 3), 0.05)  # outside, and moving along the wall
-def test_clipped_actions_stay_inside_the_workspace_and_limits(where, wild, l1) -> None:
+@example(
+    (0.27, 0.0, 0.3), np.array([[-1.0, 1, 0, 0, 0, 0, 0]] * 3), 0.05
+)  # outside the box, with motion along its face
+def test_clipped_actions_stay_inside_the_workspace_and_limits(where, unbounded_actions, l1) -> None:
     limits, state = limits_of(l1), position(*where)
     space = make_pose_search_space(PlanningConfig(limits=limits, horizon=3))
-    actions = space.clip(torch.from_numpy(wild).float()).double().numpy()
+    actions = space.clip(torch.from_numpy(unbounded_actions).float()).double().numpy()
     if not is_within_limits(box().get_return_motion(state[:3]), limits):
         return
-    kept = box().clip_actions(state, actions, limits)
-    targets = state[:3] + np.cumsum(kept[:, :3], axis=0)
+    clipped = box().clip_actions(state, actions, limits)
+    targets = state[:3] + np.cumsum(clipped[:, :3], axis=0)
     assert (targets >= np.array(CORNERS[0]) - SLACK).all()
     assert (targets <= np.array(CORNERS[1]) + SLACK).all()
-    assert is_within_limits(kept[:, :3], limits, SLACK)
-    np.testing.assert_array_equal(kept[:, 3:], actions[:, 3:])
+    assert is_within_limits(clipped[:, :3], limits, SLACK)
+    np.testing.assert_array_equal(clipped[:, 3:], actions[:, 3:])
 
 
 @given(NEAR)
@@ -61,18 +63,18 @@ def test_first_decision_of_the_search_stays_inside_the_workspace(where) -> None:
         assert (outwards * (ahead - np.where(outwards * (state[:3] - edge) > 0, state[:3], edge)) <= SLACK).all()
     assert (narrow.lower >= wide.lower).all()
     assert (narrow.upper <= wide.upper).all()
-    assert narrow.upper[1:].equal(wide.upper[1:]), "where later decisions begin is not known"
+    assert narrow.upper[1:].equal(wide.upper[1:]), "the start positions of later decisions are unknown"
 
 
 def test_robot_returns_from_slightly_outside_and_stops_far_outside() -> None:
-    run = controller(limits=LimitsConfig(workspace=CORNERS))
-    run.reset(image(100))
-    action = run.act(image(0), position(0.63, 0.0, 0.3))
+    controller = make_controller(limits=LimitsConfig(workspace=CORNERS))
+    controller.reset(image(100))
+    action = controller.act(image(0), position(0.63, 0.0, 0.3))
     assert action[0] <= -0.03 + SLACK
-    action = run.act(image(1), position(0.7, 0.0, 0.3))
+    action = controller.act(image(1), position(0.7, 0.0, 0.3))
     assert not action.any()
-    assert run.decision.why == "outside the workspace"
-    assert run.decision.plan is None
+    assert controller.decision.why == "outside the workspace"
+    assert controller.decision.plan is None
 
 
 @pytest.mark.parametrize("space", [CAMERA_POSE, make_vector_states(8)])

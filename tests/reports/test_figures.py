@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from decisions import asked, image
+from decisions import image, make_plan_result
 from evaluation_results import evaluation
 from random_decoder import write_decoder
 from tiny_models import tiny_model
@@ -55,16 +55,16 @@ def pixels_of(found: PlanResult, folder: Path) -> np.ndarray:
 
 
 def test_energy_slices_add_a_row_to_the_plan_plot(tmp_path: Path) -> None:
-    heights = [pixels_of(found, tmp_path).shape[0] for found in (asked(), asked(start=100))]
+    heights = [pixels_of(found, tmp_path).shape[0] for found in (make_plan_result(), make_plan_result(start=100))]
     assert heights == sorted(set(heights), reverse=True)
 
 
 def test_plan_without_finite_energies_is_plotted(tmp_path: Path) -> None:
-    assert pixels_of(asked(broken=True), tmp_path).std() > 10
+    assert pixels_of(make_plan_result(broken=True), tmp_path).std() > 10
 
 
 def test_many_goals_and_a_mask_are_shown(tmp_path: Path) -> None:
-    found = asked(100, 101, 102, 103, nodes=0)
+    found = make_plan_result(100, 101, 102, 103, nodes=0)
     plain = pixels_of(found, tmp_path)
     mask = np.zeros(image(0).shape[:2], bool)
     mask[:30] = True
@@ -76,7 +76,7 @@ def test_many_goals_and_a_mask_are_shown(tmp_path: Path) -> None:
 
 def test_decoded_plan_adds_a_row_even_without_a_plan(tmp_path: Path) -> None:
     decoder = load_decoder(write_decoder(tmp_path / "decoder", tiny_model()))
-    found, path = asked(start=100), tmp_path / "imagined.png"
+    found, path = make_plan_result(start=100), tmp_path / "imagined.png"
     with Image.open(plot_plan(found, path, imagine_plan(found, decoder))) as picture:
         assert picture.height > pixels_of(found, tmp_path).shape[0] + 100
 

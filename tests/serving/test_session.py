@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from decisions import vector_controller
+from decisions import make_vector_controller
 from served import STATE, controller, image, request, session
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig
 from vjepa2_ac.errors import InputError
@@ -323,10 +323,10 @@ def test_padded_image_adds_a_note() -> None:
 
 def test_vector_states_get_changes_or_targets_and_reject_poses() -> None:
     for joined in ("sum", "last"):
-        own, state = vector_controller(joined), np.full(8, 0.1)
+        own, state = make_vector_controller(joined), np.full(8, 0.1)
         own.reset(image(100))
         message = {"observation/image": image(0), "observation/state": state, "goal/image": image(100)}
-        reply = unpack(Session(vector_controller(joined)).answer(pack(message)))
+        reply = unpack(Session(make_vector_controller(joined)).answer(pack(message)))
         np.testing.assert_array_equal(reply["actions"][0], own.act(image(0), state))
         assert reply["actions"].shape == (2, 8)
         nothing = unpack(Session(own, None, SessionOptions(dry_run=True)).answer(pack(message)))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from decisions import controller
+from decisions import make_controller
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.goals import SubGoal
@@ -143,7 +143,7 @@ def test_unreachable_command_moves_the_arm_partially_and_is_counted(arm: Simulat
 
 
 def test_planner_acts_within_limits_and_stores_frames_of_some_episodes(arm: SimulatedArm) -> None:
-    policy, reported = Planning(controller(horizon=1, limits=SMALL), name="tiny"), []
+    policy, reported = Planning(make_controller(horizon=1, limits=SMALL), name="tiny"), []
     options = BenchmarkOptions("reach", DOMAIN_B, episodes=2, steps=2, films=1)
     result = run_task(options, policy, arm, lambda *numbers: reported.append(numbers))
     assert (result.policy, result.why_counts) == ("tiny", {"planned": 4})
@@ -262,7 +262,7 @@ def test_every_step_sub_goals_stop_where_the_demonstration_stops() -> None:
 
 
 def test_planner_follows_the_goals_of_the_trial() -> None:
-    planner = controller(horizon=1)
+    planner = make_controller(horizon=1)
     arm = arm_for("pick", DOMAIN_A)
     goals = demonstrated_goals(trial_with_goals("pick", DOMAIN_A, 0), arm, USUAL, "every-step")
     episode = run_trial(ArmEnvironment(arm), Planning(planner), trial_with_goals("pick", DOMAIN_A, 0, goals=goals))

@@ -20,24 +20,27 @@ def image(seed: int, height: int = 60, width: int = 48) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
-def controller(model: WorldModel | None = None, seed: int = 0, **changes: object) -> Controller:
-    """Return a controller whose search is over at once."""
+def make_controller(model: WorldModel | None = None, seed: int = 0, **changes: object) -> Controller:
+    """Return a controller of a tiny model with a short search."""
     config = QUICK.model_copy(update={"iterations": 2, **changes})
     return Controller(model or tiny_model(), config, seed=seed)
 
 
-def vector_controller(joined: str, *, states: bool = True) -> Controller:
-    """Return a controller of eight joints, whose recorded commands were joined so."""
+def make_vector_controller(joined: str, *, states: bool = True) -> Controller:
+    """Return a controller of eight joints; `joined` as in `Spaces.from_widths`."""
     config = QUICK.model_copy(update={"iterations": 2, "limits": LimitsConfig(axes=(0.1,))})
     return Controller(vector_model(8, states=states), config, spaces=Spaces.from_widths(Widths(8, 8), joined))
 
 
-def asked(*goals: int, nodes: int | None = 3, broken: bool = False, start: int = 0, **changes: object) -> PlanResult:
+def make_plan_result(
+    *goals: int, nodes: int | None = 3, broken: bool = False, start: int = 0, **changes: object
+) -> PlanResult:
+    """Return a decision of a tiny model; goals and start are seeds of images."""
     model = tiny_model()
     if broken:
         with torch.no_grad():
             model.base_predictor.predictor_proj.weight.fill_(float("nan"))
     config = QUICK.model_copy(update=changes)
     images = [image(goal) for goal in goals or (100,)]
-    question = PlanRequest(image(start), STATE, make_timed_goals(images, split_horizon(config.horizon, len(images))))
-    return decide(Controller(model, config, seed=5), question, nodes=nodes)
+    request = PlanRequest(image(start), STATE, make_timed_goals(images, split_horizon(config.horizon, len(images))))
+    return decide(Controller(model, config, seed=5), request, nodes=nodes)

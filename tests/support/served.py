@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from decisions import STATE, controller
+from decisions import STATE, make_controller
 from ranks import Rank, wait_until
 from vjepa2_ac.serving.access import Access
 from vjepa2_ac.serving.server import PlanningServer
@@ -22,7 +22,7 @@ def image(seed: int, height: int = 48, width: int = 60) -> np.ndarray:
 
 
 def session(options: SessionOptions | None = None, goals: dict | None = None, **changes: object) -> Session:
-    return Session(controller(**changes), goals, options)
+    return Session(make_controller(**changes), goals, options)
 
 
 def request(seed: int = 0, **more: object) -> dict:

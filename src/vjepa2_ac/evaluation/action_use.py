@@ -104,7 +104,7 @@ def select_moves(batch: LatentBatch, row: int, space: ActionSpace, reach: float)
         space: Meaning of the actions.
         reach: Largest length of a move, in metres; not used for vectors.
     """
-    if space.follows != "change":
+    if space.effect != "change":
         return (rollout_start(batch, row, int(batch.actions[row].norm(dim=-1).argmax())),)
     states = batch.states[row].cpu().numpy().astype(np.float64)
     state_space = make_vector_states(states.shape[1]) if space.position is None else POSE

@@ -107,7 +107,7 @@ class Explorer:
         self.world_model, self.evaluated_models, self.notes = models.world_model, models.evaluated_models, models.notes
         self.decoder, self.dataset, self.episodes, self.autocast = decoder, dataset, episodes, autocast
         self.simulate = simulate
-        if self.spaces.action.follows == "unknown":
+        if self.spaces.action.effect == "unknown":
             problem = "the effect of the recorded commands on the state is not known"
             needed = "data.actions: difference, or data.join_actions: sum or last"
             raise InputError(where="data.actions: recorded", found=problem, needed=needed)
@@ -207,7 +207,7 @@ class Explorer:
         pixels = to_display_frames(batch.frames[0].numpy(), self.world_model.image_size)
         states = batch.states[0].double().numpy()
         action = batch.actions[0, 0].double().numpy()
-        if self.spaces.action.follows == "target":
+        if self.spaces.action.effect == "target":
             action = self.spaces.state.compute_differences(np.stack([states[0], action]))[0]
         camera, latents = None if encoded.extrinsics is None else encoded.extrinsics[0, 0], encoded.latents[0]
         first = Observation(pixels[0], latents[0], states[0], tuple(action.tolist()), camera)
@@ -263,7 +263,7 @@ class Explorer:
             self.integrate_states(position),
         )
         values = states[-1]
-        if self.spaces.action.follows != "target":
+        if self.spaces.action.effect != "target":
             values = np.array(position.actions[-1])
             if self.get_recorded_observation(position) is None:  # the gripper cannot open or close beyond its range
                 values = clip_gripper_changes(states[-2], values[None], self.spaces.state)[0]
@@ -372,8 +372,8 @@ class Search:
         return self.config.model_copy(update={"horizon": steps, "action_repeat": 1})
 
     @property
-    def axes(self) -> tuple[int, ...]:
-        """The axes of the energy maps, as indices of an action: the position of a pose, or the first free numbers."""
+    def map_components(self) -> tuple[int, ...]:
+        """Components of an action that the energy maps vary: the position of a pose, or the first free numbers."""
         is_pose = self._explorer.spaces.state.is_pose
         return (0, 1, 2) if is_pose else tuple(self.make_search_space().free[:3].tolist())
 
@@ -390,7 +390,7 @@ class Search:
         progress: Progress,
         cancelled: Cancelled,
     ) -> tuple[EnergySlice, ...]:
-        """Return the energy after one more action, as maps over each pair of the numbers in `axes`.
+        """Return the energy after one more action, as maps over each pair of `map_components`.
 
         Args:
             model_index: Index of the model.
@@ -408,7 +408,12 @@ class Search:
         with self._open_cost(model_index, position, goal) as cost:
             checked_progress = make_cancellation_check(cancelled, progress)
             return compute_energy_slices(
-                cost, center_action, self.make_search_space(), self.axes, nodes=_GRID_POINTS, progress=checked_progress
+                cost,
+                center_action,
+                self.make_search_space(),
+                self.map_components,
+                nodes=_GRID_POINTS,
+                progress=checked_progress,
             )
 
     def plan(

@@ -287,8 +287,8 @@ class Views:
         maps = self.search.compute_maps(model_index, position, goal, action, progress, cancelled)
         energy_maps = [
             {
-                "across": plane.axes[0], "up": plane.axes[1], "across_values": plane.across, "up_values": plane.up,
-                "energy": plane.energy,
+                "across": plane.components[0], "up": plane.components[1],
+                "across_values": plane.across, "up_values": plane.up, "energy": plane.energy,
             }
             for plane in maps
         ]  # fmt: skip

@@ -31,7 +31,7 @@ from vjepa2_ac.inspection.variants import load_named
 from vjepa2_ac.intervals import Estimate, bootstrap, estimate_ratio
 from vjepa2_ac.model.distances import squared_difference
 from vjepa2_ac.model.lora import merge_adapter
-from vjepa2_ac.planning.energy import Axes
+from vjepa2_ac.planning.energy import AxesRotation
 from vjepa2_ac.planning.settings import AXES_FORMAT, require_calibratable
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.storage.structured import utc_now
@@ -166,7 +166,7 @@ def _errors_by_angle(
     model: Predictor, start: RolloutStart, centre_m: tuple[float, float], at_once: int
 ) -> Float[np.ndarray, " angles"]:
     """Return the mean squared error of the next frame at each angle of `TRIED_DEGREES`, with the executed action."""
-    turns = [Axes(math.radians(angle), centre_m) for angle in TRIED_DEGREES]
+    turns = [AxesRotation(math.radians(angle), centre_m) for angle in TRIED_DEGREES]
     states = torch.stack([turn.rotate_poses(start.state) for turn in turns])[:, None]
     actions = torch.stack([turn.rotate_actions(start.action) for turn in turns])[:, None]
     cameras = None

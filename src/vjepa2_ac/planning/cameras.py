@@ -39,10 +39,10 @@ class Cameras:
     model: WorldModel
     crop: Crop
     views: int = 1
-    latest_frames: tuple[CameraFrame, ...] = field(default=(), init=False)  # of each camera; empty after a reset
+    latest_frames: tuple[CameraFrame, ...] = field(default=(), init=False)  # one per camera; empty after a reset
 
     def require_contrast(self, image: Image, *, where: str) -> None:
-        """Refuse an image in which the view of a camera has no contrast; see `images.is_uniform`.
+        """Refuse an image in which the view of a camera has no contrast (`images.is_uniform`).
 
         Raises:
             InputError: The view of a camera is uniform.
@@ -56,10 +56,9 @@ class Cameras:
         space: StateSpace,
         max_change: Float[np.ndarray, " numbers"],
     ) -> tuple[tuple[CameraFrame, ...], Fault | None]:
-        """Return the latest frame of each camera, and the fault for which the robot must not move; None: no fault.
+        """Return the latest frame of each camera, and a fault that forbids motion (None: no camera has a fault).
 
-        A fault of one camera is enough. This method does not change `latest_frames`; the controller sets it after a
-        decision.
+        This method does not change `latest_frames`; the controller sets it after a decision.
 
         Args:
             frame: The current frame, with the views of all cameras side by side.
@@ -83,10 +82,10 @@ class Cameras:
             return None
         require_mask(mask, where="mask", like=like)
         pixels = np.repeat((mask > 0).astype(np.uint8)[None, ..., None], 3, axis=-1)
-        received = np.ascontiguousarray(crop_frames(split_views(pixels, self.views), self.crop)[..., 0])
+        cropped = np.ascontiguousarray(crop_frames(split_views(pixels, self.views), self.crop)[..., 0])
         grid = self.model.image_size // self.model.sizes.patch_size
         try:
-            return compute_patch_weights(torch.from_numpy(received) > 0, grid).to(self.model.device)
+            return compute_patch_weights(torch.from_numpy(cropped) > 0, grid).to(self.model.device)
         except ValueError:
             needed = "a mask that overlaps the part of the image that the model receives (data.crop)"
             raise InputError(where="mask", found="no pixel inside the cropped image", needed=needed) from None

@@ -1,4 +1,4 @@
-"""The controller: set a goal image once, then get one action for each image and state."""
+"""The controller: receives a goal image once, then returns one action for each image and state."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from vjepa2_ac.model.world_model import (
     get_model_widths,
 )
 from vjepa2_ac.planning.cameras import Cameras, Fault
-from vjepa2_ac.planning.energy import Axes, ChunkScores, EnergyFunction, Goal, Scene, WorldModelCost, distance
+from vjepa2_ac.planning.energy import AxesRotation, ChunkScores, EnergyFunction, Goal, Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, make_timed_goals, require_goal_ends
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, make_cancellation_check
@@ -38,7 +38,7 @@ from vjepa2_ac.registry import PLANNING_FILES
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces, integrate_changes
 
-_PRIOR_STEPS = 3  # remaining model steps as the prior's input if a goal has no `at_most`; fewer lead to larger motions
+_PRIOR_STEPS = 3  # steps left, as the prior receives them, if a goal has no `at_most`; fewer lead to larger motions
 State = Float[np.ndarray, " numbers"]
 Latents = Float[Tensor, "tokens dim"]
 Reason = Literal["planned", "out of time", "at the goal", "no finite energy", "outside the workspace", Fault]
@@ -56,7 +56,7 @@ class Surprise:
 PriorStart = Callable[[WorldModelCost, Latents, int, SearchSpace], PlanStart]
 """Returns the start of a search towards a goal's latents, given the number of model steps left (`planning.prior`)."""
 Compare = Callable[[Latents, Latents], Surprise]
-"""Compares the latents of a predicted frame with those of the frame (`planning.monitor`)."""
+"""Compares the latents of a predicted frame with those of the camera's frame (`planning.monitor`)."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,11 @@ class Decision:
     """An action for the next model step, and the reason for it."""
 
     action: Float[np.ndarray, " dim"]  # for the next model step; zero for some values of `why`
-    # "planned", or "out of time" with the best plan so far. For all other values the action is zero. "uniform frame":
-    # the image of a camera has no contrast. "frozen frame": an image equals the previous one, although the robot moved.
+    # "out of time": the action is from the best plan so far. For all values but this and "planned" the action is zero.
+    # "uniform frame": the image of a camera has no contrast. "frozen frame": an image equals the previous one, although
+    # the robot moved.
     why: Reason
-    current_energy: float  # energy if the image stayed as it is, to compare with the plan's; NaN for a faulty frame
+    current_energy: float  # energy of a plan in which the image stays as it is; NaN for a faulty frame
     goals: tuple[int, ...]  # index of the goal that applies in each model step of a plan
     progress: GoalProgress  # the goal that applies, since when, and why it changed
     plan: Plan | None = None  # None if the goal is reached, or the robot is outside the workspace
@@ -79,13 +80,13 @@ class Decision:
 
 
 class Controller:
-    """Plans towards a goal, one model step at a time, and stores what was observed.
+    """Plans towards a goal, one model step at a time, and stores the observations that later decisions need.
 
     The same seed, images and states give the same actions: decision n after a reset (counted from 0) uses the
     random seed `seed + n`. Actions are within `planning.limits`, for any output of the model.
 
     Example:
-        >>> controller = Controller(load_model("builtin:sim-tiny"))  # of a run: Controller.of_run(load_run(FOLDER))
+        >>> controller = Controller(load_model("builtin:sim-tiny"))  # for a run: Controller.of_run(load_run(FOLDER))
         >>> controller.reset(goal)  # height x width x 3, uint8, RGB
         >>> action = controller.act(image, state)  # 7 numbers: metres, radians, closedness
     """
@@ -103,8 +104,8 @@ class Controller:
         """Create a controller.
 
         Args:
-            world_model: A base or merged model, which is put into eval mode; or a model with an adapter, of which a
-                merged copy is used (see `planning.model_setup`).
+            world_model: The model, which is set to eval mode. If it has an adapter, the controller uses a merged copy
+                (`model_setup.prepare_for_planning`).
             config: Planning settings; None: the defaults.
             seed: Seed of all decisions.
             crop: As in training (`data.crop`).
@@ -112,10 +113,9 @@ class Controller:
             spaces: Meaning of the model's states and actions.
 
         Raises:
-            InputError: The widths of the model's states and actions do not fit `spaces`; or the effect of an action on
-                the state is unknown; or a camera pose is missing or not used; or the blocks cannot be compiled; or
-                limits for vectors are missing; or a workspace is set for vectors; or `planning.axes` were fitted for
-                another model.
+            InputError: The widths of the model's states and actions do not fit `spaces`, the effect of an action on the
+                state is unknown, a camera pose is missing or not used, the blocks cannot be compiled, limits for
+                vectors are missing, a workspace is set for vectors, or `planning.axes` was fitted for another model.
         """
         self.config = config or PlanningConfig()
         self.seed, self.crop, self.spaces = seed, crop, spaces
@@ -137,7 +137,7 @@ class Controller:
 
     def _load_files(self, world_model: WorldModel) -> None:
         """Read the calibrated axes, the monitor and the prior, and check that each was made for this model."""
-        config, self._axes = self.config, None
+        config, self._axes_rotation = self.config, None
         self._compare: Compare | None = None
         self._prior_start: PriorStart | None = None
         if not (config.axes or config.monitor or config.prior):
@@ -145,7 +145,7 @@ class Controller:
         fingerprints = world_model.fingerprints()
         if config.axes:
             require_base_frame(f"planning.axes: {config.axes}", is_base=self.spaces.state.is_base_pose)
-            self._axes = _load_axes(config.axes, fingerprints)
+            self._axes_rotation = _load_axes_rotation(config.axes, fingerprints)
         if config.monitor:
             self._compare = PLANNING_FILES.find("monitor")(config.monitor, fingerprints, self.cameras)
         if config.prior:
@@ -160,9 +160,9 @@ class Controller:
         seed: int | None = None,
         extrinsics: Float[np.ndarray, " 6"] | None = None,
     ) -> Controller:
-        """Return the controller of a trained run, with the crop of the run; `config` and `seed` default to the run's.
+        """Return the controller of a trained run, with its crop; `config` and `seed` default to those of the run.
 
-        Limits beyond the motions in the training data, and low-diversity data, are logged as warnings.
+        If limits exceed the motions in the training data, or these have a low diversity, a warning is logged.
 
         Raises:
             InputError: As `Controller`.
@@ -176,10 +176,10 @@ class Controller:
     def of_subject(
         cls, subject: Subject, *, seed: int | None = None, extrinsics: Float[np.ndarray, " 6"] | None = None
     ) -> Controller:
-        """Return the controller of a model that `load_for_planning` loaded, with its settings.
+        """Return the controller of a model that `load_for_planning` loaded.
 
         Args:
-            subject: The model; its config gives the settings, crop and spaces.
+            subject: The model, and the config with the settings for planning, the crop and the spaces.
             seed: Seed of all decisions; None: the config's.
             extrinsics: Pose of the camera, if the model uses it.
 
@@ -202,7 +202,7 @@ class Controller:
         return self._model.device
 
     @property
-    def display_axes(self) -> tuple[int, ...]:
+    def display_components(self) -> tuple[int, ...]:
         """Indices of the numbers to show, at most three: the position of a pose, or the first free numbers."""
         return (0, 1, 2) if self.spaces.state.is_pose else tuple(self.space.free[:3].tolist())
 
@@ -211,8 +211,8 @@ class Controller:
 
         Args:
             goals: RGB images, height x width x 3, uint8, all of one size.
-            durations: Model steps for which each goal but the last applies.
-            mask: Region of the image that counts towards the energy: height x width, true or 1 inside it; None: all.
+            durations: Number of model steps of each goal except the last.
+            mask: Region of the image that counts towards the energy: height x width, nonzero inside it; None: all.
 
         Raises:
             InputError: An image is invalid, sizes differ, or the mask is empty.
@@ -226,9 +226,8 @@ class Controller:
         """Set goals that apply one after another, each until its rule is met, and forget all observations.
 
         A goal applies for at least `at_least` and at most `at_most` model steps. Between these bounds the next goal
-        follows as soon as the energy of the current image is below `share` times its energy when the goal began.
-        An earlier goal never applies again. The same energy rule decides when the last goal is reached; from then on
-        the action is zero until the next reset.
+        begins to apply as soon as the energy is below `share` times the energy at the start of the goal. An earlier
+        goal never applies again. The last goal is reached by the same rule; then the action is zero until a reset.
 
         Args:
             goals: In order; images of one size.
@@ -277,8 +276,8 @@ class Controller:
             frame: The current camera image, with the size of the goal image.
             state: The measured state: pose and gripper, or a vector; a vector of any width if the model has no state
                 input and an action is a change of the state.
-            samples: Actions that a policy proposes, as changes of each model step (`policies.score`): the search starts
-                from their mean and standard deviation. None: from `planning.prior`, if any.
+            samples: Actions that a policy proposes, as changes of the state in each model step (`policies.score`). The
+                search starts from their mean and standard deviation; None: from `planning.prior`, if it is set.
             cancelled: Called before every iteration; returns whether the action is no longer needed.
 
         Raises:
@@ -323,7 +322,7 @@ class Controller:
             cancelled: Called after every `planning.energy.samples_at_once` chunks; returns whether to stop.
 
         Raises:
-            InputError: As for `act`; or the frame has no contrast, or the chunks have another shape.
+            InputError: As for `act`, or the frame has no contrast, or the chunks have another shape.
             SearchCancelledError: `cancelled` returned true.
             ValueError: No goal was set.
         """
@@ -343,19 +342,19 @@ class Controller:
         )
 
     def _check_input(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " dim"]:
-        """Return the measured state; refuse a frame or a state that cannot be used, and a controller without a goal."""
+        """Return the measured state as float64; refuse an unusable frame or state, and a controller without a goal."""
         if not self._goals:
             raise ValueError("no goal was set; call reset first")
         require_image(frame, where="frame", like=self._goals[0].image)
         state, space = np.asarray(state, dtype=np.float64), self.spaces.state
-        is_needed = self._model.sizes.predictor.use_states or self.spaces.action.follows != "change"
+        is_needed = self._model.sizes.predictor.use_states or self.spaces.action.effect != "change"
         if not is_needed and not space.is_pose and state.shape != (len(space),):
             state = np.zeros(len(space))  # the model takes no states, so a vector may have any width
         space.require_state(state, "state")
         return state
 
     def _decide_without_motion(self, state: np.ndarray, why: Fault) -> Decision:
-        """Return a zero action for a faulty frame; the goal stays, since the frame does not show if it is reached."""
+        """Return a zero action for a faulty frame; the goal is unchanged, since the frame may be wrong."""
         progress = self._progress or GoalProgress(0, 0, math.nan)
         goals, command = (progress.goal_index,) * self.space.steps, self._get_command(state, np.zeros(len(state)))
         return Decision(command, why, math.nan, goals, replace(progress, changed=""), is_done=progress.is_done)
@@ -379,7 +378,7 @@ class Controller:
         return self._progress.advance(self._goals, self._num_decisions, energy)
 
     def _get_goal(self, index: int) -> Goal:
-        """Return a goal and the later goals that a long plan can reach, with `at_most` as the durations."""
+        """Return a goal and the later goals that can apply during a plan, each with `at_most` as its duration."""
         durations: list[int] = []
         for goal in self._goals[index:-1]:
             if goal.at_most is None:
@@ -400,14 +399,16 @@ class Controller:
 
     def _make_cost(self, latents: Latents, state: State, progress: GoalProgress) -> WorldModelCost:
         goal, elapsed_steps = self._get_goal(progress.goal_index), self._num_decisions - progress.start_step
-        scene = Scene(latents, torch.from_numpy(state).float(), self._camera_pose, self._axes, self.config.views)
-        return WorldModelCost(self._model, scene, goal, self._energy, done=elapsed_steps, spaces=self.spaces)
+        scene = Scene(
+            latents, torch.from_numpy(state).float(), self._camera_pose, self._axes_rotation, self.config.views
+        )
+        return WorldModelCost(self._model, scene, goal, self._energy, elapsed_steps=elapsed_steps, spaces=self.spaces)
 
     def _combine_steps(self, energies: Float[Tensor, " steps"]) -> float:
         return float(energies[-1] if self.config.energy.steps == "last" else energies.sum())
 
     def _decide(self, latents: Latents, state: State, samples: np.ndarray | None, cancelled: Cancelled) -> Decision:
-        """Return the decision at a usable frame: a plan, or a zero action if no motion is needed or possible."""
+        """Return the decision for a frame without a fault: a plan, or zero if no motion is needed or possible."""
         progress = self._update_progress(latents)
         current_energies, goal_indices = self._compute_current_energies(latents, progress, self.config.horizon)
         energy = self._combine_steps(current_energies)
@@ -437,7 +438,7 @@ class Controller:
         )
 
     def _measure_surprise(self, latents: Latents) -> Surprise | None:
-        """Return the difference between the current frame and the prediction of the last decision."""
+        """Return the difference between the current frame and its prediction by the last decision."""
         previous = self.decision
         if self._compare is None or previous is None or previous.cost is None or previous.plan is None:
             return None
@@ -491,10 +492,10 @@ class Controller:
 
     def _get_command(self, state: np.ndarray, change: np.ndarray) -> Float[np.ndarray, " action_dim"]:
         """Return the action for a change of the state: the change itself, or the resulting state."""
-        return state + change if self.spaces.action.follows == "target" else change
+        return state + change if self.spaces.action.effect == "target" else change
 
 
-def _load_axes(path: str, fingerprints: Fingerprints) -> Axes:
+def _load_axes_rotation(path: str, fingerprints: Fingerprints) -> AxesRotation:
     """Read calibrated axes, and check that they were fitted for this model.
 
     Raises:
@@ -505,7 +506,7 @@ def _load_axes(path: str, fingerprints: Fingerprints) -> Axes:
         problem = f"axes that were calibrated for another model, {axes.subject}"
         fix = "Calibrate them for this model: `vjepa2-ac data calibrate CONFIG --axes MODEL`"
         raise InputError(where=f"planning.axes: {path}", found=problem, fix=fix)
-    return Axes(math.radians(axes.yaw_degrees), axes.centre_m)
+    return AxesRotation(math.radians(axes.yaw_degrees), axes.centre_m)
 
 
 def _require_camera_pose(model: WorldModel, extrinsics: np.ndarray | None, views: int) -> None:
@@ -527,7 +528,7 @@ def _require_spaces(model: WorldModel, spaces: Spaces) -> None:
             f"states of {spaces.widths.state} and actions of {spaces.widths.action} numbers, as in its training data"
         )
         raise InputError(where="model", found=describe_model_widths(model.sizes), needed=needed)
-    if spaces.action.follows == "unknown":
+    if spaces.action.effect == "unknown":
         problem = "recorded actions whose effect on the state is unknown"
         fix = "To plan, train with data.actions: difference, or with data.join_actions: sum or last"
         raise InputError(where="data.actions: recorded", found=problem, fix=fix)

@@ -1,6 +1,6 @@
-"""Counterfactual actions, named (`up`, `close`) or read from a file: actions that the robot did not execute.
+"""Counterfactual actions, which the robot did not execute: named (`up`, `close`), or read from a file.
 
-No simulator is needed: a model can predict their outcome from any frame of recorded robot data.
+A model can predict the outcome of such actions from any frame of recorded robot data, without a simulator.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from vjepa2_ac.planning.search_space import GRIPPER
 from vjepa2_ac.spaces import POSE_CHANGE
 
 STEP_M, GRIPPER_STEP = 0.05, 0.75
-"""Size of a named action in one model step, in metres and in closedness: upstream's planning limits. If the training
-data contain only smaller motions, predictions for this size are unreliable."""
+"""Size of a named action in one model step, in metres and in closedness, as upstream's planning limits. Predictions are
+unreliable if the training data contain only smaller motions."""
 
 _DIRECTIONS: dict[str, tuple[int, float]] = {  # in the robot base frame: x to the front, y to the left, z up
     "up": (2, 1.0), "down": (2, -1.0),
@@ -34,18 +34,17 @@ _MAX_ACTION = np.array([1.0] * 3 + [np.pi] * 3 + [1.0])  # metres, radians, clos
 def make_named_actions(
     name: str, steps: int, *, size_m: float = STEP_M, limits: LimitsConfig | None = None
 ) -> Float[np.ndarray, "steps 7"]:
-    """Return the action of a name, repeated for every model step (conventions: episode.py).
+    """Return the action with a name, repeated for every model step (conventions: episode.py).
 
-    `open` and `close` command further change after the gripper is fully open or closed, as
-    `planning.limits.gripper_mode: close` does, because a real gripper lags behind. Pass the result through
-    `feasible_actions` before a model predicts from it.
+    `open` and `close` continue when the gripper is fully open or closed, as for `planning.limits.gripper_mode: close`,
+    because a real gripper lags behind. Pass the result through `feasible_actions` before a model predicts from it.
 
     Args:
         name: One of `ACTION_NAMES`.
         steps: Number of model steps.
         size_m: Length of each step in metres; clipped to the limits.
-        limits: The largest actions, ideally those of the training data (`planning.limits.xyz: data`, resolved). None:
-            `size_m` is not clipped, and the gripper changes by `GRIPPER_STEP`.
+        limits: The largest actions, ideally those in the training data (`planning.limits.xyz: data`). None: `size_m` is
+            not clipped, and the gripper changes by `GRIPPER_STEP`.
 
     Raises:
         InputError: The name is unknown, the limits fix the component that it changes, or the length is not positive.
@@ -106,7 +105,7 @@ def read_actions(path: str | Path, *, steps: int | None = None) -> Float[np.ndar
         raise invalid_file(found=f"cannot be read ({error})") from None
     if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not len(actions):
         raise invalid_file(found=f"an array of shape {actions.shape}")
-    is_invalid = ~(np.abs(actions) <= _MAX_ACTION).all(axis=1)  # NaN is invalid, too
+    is_invalid = ~(np.abs(actions) <= _MAX_ACTION).all(axis=1)  # true for NaN as well
     if is_invalid.any():
         step = int(is_invalid.argmax())
         raise invalid_file(found=f"action {step} is {np.array2string(actions[step], precision=4, max_line_width=200)}")

@@ -1,4 +1,4 @@
-"""A planning decision: one planned action, with the energies of alternatives to assess it."""
+"""A planning decision: one planned action, and the energies of alternative actions for comparison."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class PlanRequest:
 
     @property
     def durations(self) -> list[int]:
-        """Number of model steps of each goal except the last; empty unless all these numbers are fixed."""
+        """Number of model steps of each goal except the last; empty if one of these numbers is not fixed."""
         all_but_last = self.goals[:-1]
         is_fixed = all(goal.at_least == goal.at_most for goal in all_but_last)
         return [goal.at_least for goal in all_but_last] if is_fixed else []
@@ -43,7 +43,7 @@ class PlanRequest:
 
 @dataclass(frozen=True, eq=False)
 class PlanResult:
-    """A decision, with its alternatives."""
+    """A decision, and the energies of alternative actions."""
 
     request: PlanRequest
     controller: Controller
@@ -52,7 +52,7 @@ class PlanResult:
     states: Float[np.ndarray, "steps+1 dim"]  # predicted states before and after these actions
     zero_action_energy: float  # predicted energy of the zero action; NaN if it was not computed
     slices: tuple[EnergySlice, ...]  # empty if there is no plan, or none were requested
-    seconds: dict[str, float]  # for encoding the goals, the decision (with encoding the start), and the slices
+    seconds: dict[str, float]  # for encoding the goals, for the decision (including its frame), and for the slices
 
     @property
     def space(self) -> SearchSpace:
@@ -78,7 +78,7 @@ class PlanResult:
 
 
 def decide(controller: Controller, request: PlanRequest, *, nodes: int = 0, reporter: Reporter = SILENT) -> PlanResult:
-    """Make one decision, and evaluate its alternatives.
+    """Make one decision, and evaluate alternative actions.
 
     Args:
         controller: The controller that plans; its goals are replaced by those of the request.
@@ -104,10 +104,10 @@ def decide(controller: Controller, request: PlanRequest, *, nodes: int = 0, repo
     if plan is not None and decision.cost is not None:
         with torch.no_grad():
             zero_action_energy = float(decision.cost(torch.zeros_like(plan.actions)[None])[0])
-        axes = controller.display_axes
-        if decision.why != "no finite energy" and nodes >= 3 and len(axes) >= 2:
+        components = controller.display_components
+        if decision.why != "no finite energy" and nodes >= 3 and len(components) >= 2:
             task = reporter.task("energy maps", "action sequences")
-            slices = compute_energy_slices(decision.cost, plan.actions, space, axes, nodes=nodes, progress=task)
+            slices = compute_energy_slices(decision.cost, plan.actions, space, components, nodes=nodes, progress=task)
     times.append(time.perf_counter())
     return PlanResult(
         request=request,
@@ -124,11 +124,11 @@ def decide(controller: Controller, request: PlanRequest, *, nodes: int = 0, repo
 PLAN_FILE = "plan.json"
 FORMAT = 1  # incremented when a reader of the file would have to change
 
-_AT_LIMIT = 0.98  # an action of at least this share of its limit counts as being at the limit
+_AT_LIMIT = 0.98  # an action is at its limit if it is at least this fraction of the limit
 
 
 def write_plan(result: PlanResult, about: Mapping[str, Any], path: Path) -> Path:
-    """Write a decision as JSON; the file is written atomically, and numbers that are not finite are null.
+    """Write a decision to a JSON file, atomically; numbers that are not finite become null.
 
     Args:
         result: The decision.
@@ -137,17 +137,17 @@ def write_plan(result: PlanResult, about: Mapping[str, Any], path: Path) -> Path
     """
     decision, request, controller = result.decision, result.request, result.controller
     plan, progress, names = decision.plan, decision.progress, result.state_space.change_names
-    rules = ("name", "at_least", "at_most", "share", "gripper")
-    recorded = ("samples", "finite", "lowest", "mean", "std", "seconds")
+    goal_fields = ("name", "at_least", "at_most", "share", "gripper")
+    iteration_fields = ("samples", "finite", "lowest", "mean", "std", "seconds")
     energy = {
         "now": decision.current_energy,
         "began": progress.initial_energy,
         "doing_nothing": result.zero_action_energy,
     }
     slices = []
-    for part in result.slices:
-        across, up = (names[axis] for axis in part.axes)
-        slices.append({"across": across, "up": up, across: part.across, up: part.up, "energy": part.energy})
+    for plane in result.slices:
+        across, up = (names[component] for component in plane.components)
+        slices.append({"across": across, "up": up, across: plane.across, up: plane.up, "energy": plane.energy})
     content = {
         "format": FORMAT,
         "in_words": summarize(result),
@@ -162,14 +162,14 @@ def write_plan(result: PlanResult, about: Mapping[str, Any], path: Path) -> Path
         "actions": result.actions,
         "states": result.states,
         "goal_of_each_step": decision.goals,
-        "sub_goals": [{name: getattr(goal, name) for name in rules} for goal in request.goals],
+        "sub_goals": [{name: getattr(goal, name) for name in goal_fields} for goal in request.goals],
         "since": progress.start_step,
         "changed": progress.changed,
         "done": decision.is_done,
         "energy": energy | {"plan": None if plan is None else plan.energy},
         "evaluations": 0 if plan is None else plan.evaluations,
         "iterations": [
-            {name: getattr(iteration, name) for name in recorded} | {"elites_mean": iteration.elite_energy}
+            {name: getattr(iteration, name) for name in iteration_fields} | {"elites_mean": iteration.elite_energy}
             for iteration in (() if plan is None else plan.iterations)
         ],
         "slices": slices,
@@ -207,7 +207,7 @@ def summarize(result: PlanResult) -> str:
         sentences.append(
             f"The time budget ended the search after {iterations} of {result.controller.config.iterations} iterations."
         )
-    if at_limit := find_axes_at_limit(result):
+    if at_limit := find_components_at_limit(result):
         key = f"planning.limits.{'xyz' if result.state_space.is_pose else 'axes'}"
         sentences.append(f"The first action is at its limit along {', '.join(at_limit)} ({key}).")
     return " ".join(sentences)
@@ -219,8 +219,8 @@ def _relative_change(energy: float, reference: float) -> str:
 
 def _describe_motion(result: PlanResult) -> str:
     space, change, steps = result.state_space, result.states[-1] - result.states[0], len(result.actions)
-    displayed = change[list(result.controller.display_axes)] * (space.display_factor if space.is_pose else 1.0)
-    names = [space.change_names[axis] for axis in result.controller.display_axes]
+    displayed = change[list(result.controller.display_components)] * (space.display_factor if space.is_pose else 1.0)
+    names = [space.change_names[component] for component in result.controller.display_components]
     duration = f"in {counted(steps, 'model step')}"
     if not space.is_pose:
         parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, displayed, strict=True))
@@ -233,11 +233,11 @@ def _describe_motion(result: PlanResult) -> str:
     return f"Moves {np.linalg.norm(displayed):.1f} {unit} {duration} ({parts} {unit}{gripper_text})."
 
 
-def find_axes_at_limit(result: PlanResult) -> list[str]:
-    """Return the names of the components of the first action that are at their limits (position or vector)."""
+def find_components_at_limit(result: PlanResult) -> list[str]:
+    """Return the names of the components of the first action that are at their limits; for poses, only dx, dy, dz."""
     upper, space = result.space.upper[0].numpy(), result.state_space
-    numbers = result.controller.display_axes if space.is_pose else range(len(space))
+    components = result.controller.display_components if space.is_pose else range(len(space))
     return [
-        space.change_names[number] for number in numbers
-        if upper[number] > 0 and abs(result.actions[0, number]) >= _AT_LIMIT * upper[number]
+        space.change_names[component] for component in components
+        if upper[component] > 0 and abs(result.actions[0, component]) >= _AT_LIMIT * upper[component]
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The planning energy: distance to the goal after an action sequence, predicted by the world model."""
+"""The planning energy: the distance between the latents predicted for an action sequence and those of the goal."""
 
 from __future__ import annotations
 
@@ -49,19 +49,21 @@ class Goal:
                 return index
         return len(self.latents) - 1
 
-    def get_latents(self, done: int, steps: int) -> Float[Tensor, "steps tokens dim"]:
-        """Return the latents of the goal that applies in each of the next steps, after `done` steps.
+    def get_latents(self, elapsed_steps: int, steps: int) -> Float[Tensor, "steps tokens dim"]:
+        """Return the latents of the goal that applies in each of the next `steps` steps, after `elapsed_steps` steps.
 
         The frame after a goal's last step is still compared with that goal.
         """
-        indices = [self.get_index(done + step) for step in range(steps)]
-        return torch.stack([self.latents[index] for index in indices])  # a list as an index would wait for the device
+        indices = [self.get_index(elapsed_steps + step) for step in range(steps)]
+        return torch.stack(
+            [self.latents[index] for index in indices]
+        )  # indexing with a list would synchronise with the GPU
 
 
 def compute_patch_weights(
     mask: Bool[Tensor, "*views height width"] | Float[Tensor, "*views height width"], grid: int
 ) -> Weights:
-    """Return the weight of each patch: the mean of a mask over the patch, patches row by row, view after view.
+    """Return the weight of each patch, row by row and view after view: the mean of a mask over the patch.
 
     Args:
         mask: Mask over the cropped image, at any resolution; 1 for pixels that count, else 0.
@@ -77,11 +79,11 @@ def compute_patch_weights(
 
 
 @dataclass(frozen=True)
-class Axes:
+class AxesRotation:
     """A rotation about a vertical axis, from the robot's axes to the model's.
 
-    The search is over actions in the robot's axes, so the limits hold for the executed actions. The model receives each
-    action and state rotated.
+    The search uses the robot's axes, so the limits apply to the executed actions. The model receives rotated actions
+    and states.
 
     Source: arXiv 2506.09985, appendix B.4, which rotates inferred motions by a measured angle.
     """
@@ -92,49 +94,47 @@ class Axes:
     def rotate_poses(self, poses: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch numbers"]:
         """Return rotated poses: x, y, z and three angles; further numbers, such as the gripper, are unchanged."""
         with torch.autocast(poses.device.type, enabled=False):
-            axes_rotation, centre = self._get_rotation(poses), poses.new_tensor([*self.centre_m, 0.0])
-            rotation = euler_from_matrices(axes_rotation @ matrices_from_euler(poses[..., _ROTATION]))
-            position = (poses[..., _POSITION] - centre) @ axes_rotation.T + centre
+            matrix, centre = self._get_matrix(poses), poses.new_tensor([*self.centre_m, 0.0])
+            rotation = euler_from_matrices(matrix @ matrices_from_euler(poses[..., _ROTATION]))
+            position = (poses[..., _POSITION] - centre) @ matrix.T + centre
             return torch.cat([position, rotation, poses[..., 6:]], dim=-1)
 
     def rotate_actions(self, actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
         """Return rotated actions: the translation and the axis of the rotation are rotated."""
         with torch.autocast(actions.device.type, enabled=False):
-            axes_rotation = self._get_rotation(actions)
-            rotation = euler_from_matrices(
-                axes_rotation @ matrices_from_euler(actions[..., _ROTATION]) @ axes_rotation.T
-            )
-            return torch.cat([actions[..., _POSITION] @ axes_rotation.T, rotation, actions[..., 6:]], dim=-1)
+            matrix = self._get_matrix(actions)
+            rotation = euler_from_matrices(matrix @ matrices_from_euler(actions[..., _ROTATION]) @ matrix.T)
+            return torch.cat([actions[..., _POSITION] @ matrix.T, rotation, actions[..., 6:]], dim=-1)
 
-    def _get_rotation(self, like: Tensor) -> Float[Tensor, "3 3"]:
-        axes_rotation: Tensor = matrices_from_euler(like.new_tensor([0.0, 0.0, self.yaw]))
-        return axes_rotation
+    def _get_matrix(self, like: Tensor) -> Float[Tensor, "3 3"]:
+        matrix: Tensor = matrices_from_euler(like.new_tensor([0.0, 0.0, self.yaw]))
+        return matrix
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The input of a decision: latents of the current frame (views concatenated), and the state."""
+    """The observation before the first action: latents of the frame (views concatenated), and the state."""
 
     latents: Float[Tensor, "tokens dim"]
     state: Float[Tensor, " state_dim"]
     extrinsics: Float[Tensor, " 6"] | None = None  # pose of the camera, which is fixed
-    axes: Axes | None = None  # rotation to the model's axes; None: they equal the robot's
+    axes_rotation: AxesRotation | None = None  # None: the model's axes equal the robot's
     views: int = 1
 
     def to_model_axes(
         self, actions: Float[Tensor, "*batch action_dim"], states: Float[Tensor, "*batch state_dim"]
     ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch state_dim"]]:
-        """Return actions and states as the model receives them: rotated to the calibrated axes, if there are any."""
-        if self.axes is None:
+        """Return actions and states as the model receives them: in its axes."""
+        if self.axes_rotation is None:
             return actions, states
-        return self.axes.rotate_actions(actions), self.axes.rotate_poses(states)
+        return self.axes_rotation.rotate_actions(actions), self.axes_rotation.rotate_poses(states)
 
     @property
     def camera(self) -> Float[Tensor, " 6"] | None:
-        """Pose of the camera as the model receives it."""
-        if self.axes is None or self.extrinsics is None:
+        """Pose of the camera as the model receives it: in its axes."""
+        if self.axes_rotation is None or self.extrinsics is None:
             return self.extrinsics
-        return self.axes.rotate_poses(self.extrinsics)
+        return self.axes_rotation.rotate_poses(self.extrinsics)
 
 
 @dataclass(frozen=True)
@@ -162,17 +162,17 @@ class WorldModelCost:
         goal: Goal,
         energy: EnergyConfig | EnergyFunction,
         *,
-        done: int = 0,
+        elapsed_steps: int = 0,
         spaces: Spaces = POSES,
     ) -> None:
         """Move everything that all samples share to the model's device.
 
         Args:
-            world_model: In eval mode: dropout would make energies differ from call to call.
+            world_model: The model, in eval mode, because dropout would make energies differ from call to call.
             scene: The frame and state before the first action.
             goal: The goal latents.
             energy: The distance, and the number of samples per batch.
-            done: Model steps since the goal was set: selects the goal that applies.
+            elapsed_steps: Model steps since the first goal of `goal` began to apply.
             spaces: Meaning of the model's states and actions. The evaluated actions are changes of the state; if the
                 model's actions are targets, the model receives the resulting states.
 
@@ -183,46 +183,45 @@ class WorldModelCost:
             raise ValueError("the model is in training mode, so dropout would change the energies; call eval() first")
         device = world_model.device
         self._model, self._energy = world_model, EnergyFunction.from_config(energy)
-        self._spaces, self._done = spaces, done
+        self._spaces, self._elapsed_steps = spaces, elapsed_steps
         weights = None if goal.weights is None else goal.weights.to(device)
         self._goal = Goal(goal.latents.to(device), goal.durations, weights)
         self._frame, self._state = scene.latents.to(device), scene.state.to(device)
         self._camera = None if scene.camera is None else scene.camera.to(device)
         self._to_model_axes, self.views = scene.to_model_axes, scene.views
-        self.progress: Progress = no_progress  # called after each part, without waiting for the device
+        self.progress: Progress = no_progress  # called after each batch, which the device may not have finished yet
 
     def __call__(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
         """Return energies on the device of the actions; gradients flow to the actions if gradients are enabled.
 
-        With gradients and more than one part, the predictions of each part are recomputed in the backward pass, so that
-        memory is bounded.
+        With gradients and more than one batch, the predictions are recomputed in the backward pass to save memory.
         """
-        parts = actions.to(self._model.device).split(self._energy.config.samples_at_once)  # type: ignore[no-untyped-call]  # torch
-        recompute = torch.is_grad_enabled() and len(parts) > 1
+        batches = actions.to(self._model.device).split(self._energy.config.samples_at_once)  # type: ignore[no-untyped-call]
+        recompute = torch.is_grad_enabled() and len(batches) > 1
         energies: list[Tensor] = []
-        done = 0
-        for part in parts:
+        num_evaluated = 0
+        for batch in batches:
             if recompute:
-                energies.append(checkpoint(self._compute_energies, part, use_reentrant=False))
+                energies.append(checkpoint(self._compute_energies, batch, use_reentrant=False))
             else:
-                energies.append(self._compute_energies(part))
-            done += len(part)
-            self.progress(done, len(actions))
+                energies.append(self._compute_energies(batch))
+            num_evaluated += len(batch)
+            self.progress(num_evaluated, len(actions))
         return torch.cat(energies).to(actions.device)
 
     @property
     def current(self) -> tuple[Float[Tensor, "tokens dim"], Float[Tensor, " state_dim"]]:
-        """Latents of the current frame, and the state."""
+        """Latents of the frame before the first action, and the state, on the model's device."""
         return self._frame, self._state
 
     def rollout(
         self, actions: Float[Tensor, "samples steps action_dim"]
     ) -> tuple[Float[Tensor, "samples steps tokens dim"], Float[Tensor, "samples steps+1 state_dim"]]:
-        """Return the predicted latents after each action, and the states before and after it, in one batch."""
+        """Return the predicted latents after each action and the states before and after each action, in one batch."""
         samples, steps = actions.shape[:2]
         actions = actions.to(self._state)
         states = integrate_changes(self._state, actions, self._spaces.state)
-        inputs = states[:, 1:] if self._spaces.action.follows == "target" else actions
+        inputs = states[:, 1:] if self._spaces.action.effect == "target" else actions
         camera = None if self._camera is None else self._camera.expand(samples, steps, -1)
         dim = self._frame.shape[-1]
         views = self._frame.reshape(1, self.views, -1, dim)
@@ -235,7 +234,7 @@ class WorldModelCost:
 
     def _compute_energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
         predicted, _ = self.rollout(actions)
-        target = self._goal.get_latents(self._done, actions.shape[1])
+        target = self._goal.get_latents(self._elapsed_steps, actions.shape[1])
         if self._energy.config.steps == "last":
             predicted, target = predicted[:, -1:], target[-1:]
         distances = distance(predicted, target, self._energy, self._goal.weights)
@@ -245,7 +244,7 @@ class WorldModelCost:
 def distance(
     predicted: Latents, target: Target, energy: EnergyConfig | EnergyFunction, weights: Weights | None = None
 ) -> Distances:
-    """Return the distance between latents that a config names, averaged over patches (weights None: equal weights).
+    """Return the distance that a config names between latents, as the weighted mean over patches.
 
     For several calls pass an `EnergyFunction`, so that an energy that is a class is constructed once.
     """
@@ -315,14 +314,14 @@ class ChunkScores:
 
 
 _SLICE_FACTOR = 1.25  # half-width of a slice, relative to the limit
-_MIN_HALF_WIDTH_M = 0.05  # metres; smallest half-width of a slice along a fixed axis
+_MIN_HALF_WIDTH_M = 0.05  # metres; smallest half-width of a slice along a fixed component
 
 
 @dataclass(frozen=True)
 class EnergySlice:
     """Energies over two components of the first action; all other components of the plan are unchanged."""
 
-    axes: tuple[int, int]  # indices of the two components
+    components: tuple[int, int]  # their indices
     across: Float[np.ndarray, " nodes"]  # values of the first component
     up: Float[np.ndarray, " nodes"]  # values of the second component
     energy: Float[np.ndarray, "nodes nodes"]  # [up, across]; NaN where the prediction is not finite
@@ -332,42 +331,44 @@ def compute_energy_slices(
     cost: Cost,
     actions: Float[Tensor, "steps dim"],
     space: SearchSpace,
-    axes: Sequence[int] = (0, 1, 2),
+    components: Sequence[int] = (0, 1, 2),
     *,
     nodes: int,
     progress: Progress = no_progress,
 ) -> tuple[EnergySlice, ...]:
-    """Return the energy around a plan's first action, over each pair of its components in `axes`, such as dx and dy.
+    """Return the energy around a plan's first action, over each pair of the given components, such as dx and dy.
 
-    The slices reach beyond the limits, to show the energy there. If the first action is repeated, all repetitions
-    change together.
+    The slices extend beyond the limits. If the first action is repeated, all repetitions change together.
 
     Args:
         cost: The energy of action sequences.
         actions: The plan.
-        space: Its limits set the width of the slices.
-        axes: Indices of the components.
-        nodes: Number of values along each axis, three or more.
+        space: The search space, whose limits set the width of the slices.
+        components: Indices of two or more components of an action.
+        nodes: Number of values of each component, three or more.
         progress: Called with the number of evaluated action sequences.
     """
-    total, slices = comb(len(axes), 2) * nodes**2, []
+    total, slices = comb(len(components), 2) * nodes**2, []
     progress(0, total)
-    for number, pair in enumerate(combinations(axes, 2)):
-        with report_progress(cost, progress, done=number * nodes**2, share=nodes**2, total=total):
+    for number, pair in enumerate(combinations(components, 2)):
+        with report_progress(cost, progress, num_before=number * nodes**2, num_added=nodes**2, total=total):
             slices.append(_compute_slice(cost, actions, space, pair, nodes))
     return tuple(slices)
 
 
 @torch.no_grad()
-def _compute_slice(cost: Cost, actions: Tensor, space: SearchSpace, axes: tuple[int, int], nodes: int) -> EnergySlice:
-    across, up = (_SLICE_FACTOR * _half_width(space, axis, axes) * torch.linspace(-1, 1, nodes) for axis in axes)
+def _compute_slice(cost: Cost, actions: Tensor, space: SearchSpace, pair: tuple[int, int], nodes: int) -> EnergySlice:
+    across, up = (
+        _SLICE_FACTOR * _half_width(space, component, pair) * torch.linspace(-1, 1, nodes) for component in pair
+    )
     evaluated = actions.repeat(nodes * nodes, 1, 1)
-    evaluated[:, : space.repeat, axes[0]] = across.repeat(nodes)[:, None]
-    evaluated[:, : space.repeat, axes[1]] = up.repeat_interleave(nodes)[:, None]
+    evaluated[:, : space.repeat, pair[0]] = across.repeat(nodes)[:, None]
+    evaluated[:, : space.repeat, pair[1]] = up.repeat_interleave(nodes)[:, None]
     energy = cost(evaluated).float().cpu().reshape(nodes, nodes)
-    return EnergySlice(axes, across.double().numpy(), up.double().numpy(), energy.double().numpy())
+    return EnergySlice(pair, across.double().numpy(), up.double().numpy(), energy.double().numpy())
 
 
-def _half_width(space: SearchSpace, axis: int, axes: Sequence[int]) -> float:
-    reach = float(torch.maximum(space.upper[0, axis].abs(), space.lower[0, axis].abs()))
-    return reach or max(*(float(space.upper[0, number]) for number in axes), _MIN_HALF_WIDTH_M)
+def _half_width(space: SearchSpace, component: int, pair: Sequence[int]) -> float:
+    """Return the limit of a component; for a component that is fixed at zero, the larger limit of the pair."""
+    limit = float(torch.maximum(space.upper[0, component].abs(), space.lower[0, component].abs()))
+    return limit or max(*(float(space.upper[0, number]) for number in pair), _MIN_HALF_WIDTH_M)

@@ -34,11 +34,13 @@ class SubGoal:
         InputError: The numbers contradict each other.
     """
 
-    image: np.ndarray  # RGB, height x width x 3, uint8; not checked here
+    image: np.ndarray  # RGB, height x width x 3, uint8; the controller checks it
     name: str = ""
     at_least: int = 1  # model steps
-    at_most: int | None = None  # model steps; None: no bound, as required for the last goal
-    share: float | None = None  # the next goal follows when energy < share x energy at the start; None: by steps only
+    at_most: int | None = None  # model steps; None: no bound. The last goal must have none
+    share: float | None = (
+        None  # reached when energy < share x energy at the start of the goal; None: only `at_most` ends it
+    )
     gripper: GripperMode | None = None  # None: planning.limits.gripper_mode
 
     def __post_init__(self) -> None:
@@ -50,9 +52,9 @@ class SubGoal:
             raise InputError(where=where, found=f"share {self.share}", needed="a number between 0 and 1, or none")
 
     def explain_reached(self, energy: float, initial_energy: float) -> str:
-        """Return why the goal counts as reached at an energy; empty: not reached.
+        """Return why the goal is reached at an energy; empty: not reached.
 
-        `initial_energy` is the energy when the goal began to apply.
+        `initial_energy` is the energy at the start of the goal.
         """
         if self.share is None:
             return ""
@@ -62,7 +64,7 @@ class SubGoal:
 
 
 def split_horizon(horizon: int, goals: int) -> tuple[int, ...]:
-    """Return equal durations, in model steps, for all goals of a plan except the last, which gets the rest."""
+    """Return equal durations, in model steps, for all goals of a plan except the last."""
     return (max(1, horizon // goals),) * (goals - 1)
 
 
@@ -84,11 +86,11 @@ def require_goal_ends(goals: Sequence[SubGoal], *, first: int = 0) -> None:
     """Refuse goals without an end (neither `at_most` nor `share`), or a last goal with a bound.
 
     Args:
-        goals: In order.
+        goals: The goals in order.
         first: Number of the first goal in messages.
 
     Raises:
-        InputError: Names the goal.
+        InputError: A goal has no end, or the last goal has a bound.
     """
     *all_but_last, last = goals
     for number, goal in enumerate(all_but_last, start=first):
@@ -101,15 +103,15 @@ def require_goal_ends(goals: Sequence[SubGoal], *, first: int = 0) -> None:
 
 @dataclass(frozen=True)
 class GoalProgress:
-    """The goal that applies at a decision, and since when. The index never decreases.
+    """The goal that applies at a decision, and the step at which it began. The index never decreases.
 
     Source of the rule: zcczhang/UVD @ e7d657a, uvd/envs/evaluator/inference_wrapper.py: energy relative to the energy
     at the beginning of the sub-goal, within bounds on the number of steps.
     """
 
-    goal_index: int  # index of the goal
+    goal_index: int
     start_step: int  # model step, counted from the reset, at which the goal began
-    initial_energy: float  # energy between the image at that step and the goal
+    initial_energy: float  # energy of the image at `start_step`
     changed: str = ""  # why the goal changed, or why the last goal is reached; empty: nothing changed
     is_done: bool = False  # whether the last goal has been reached
 
@@ -117,9 +119,9 @@ class GoalProgress:
         """Return the progress at a later decision: the same goal, or the next one.
 
         Args:
-            goals: In order. The last goal is reached by its energy rule only.
+            goals: The goals in order. Only the energy rule can end the last goal.
             step: Number of model steps since the reset.
-            energy: Returns the energy between the current image and the goal with an index.
+            energy: Returns the energy of the current image for the goal with a given index.
         """
         goal, steps, unchanged = goals[self.goal_index], step - self.start_step, replace(self, changed="")
         if self.is_done or steps < goal.at_least:
@@ -157,7 +159,7 @@ class GoalEntry:
 
 @dataclass(frozen=True)
 class _GoalsFile:
-    format: Literal[1]  # incremented when a reader of the file would have to change
+    format: Literal[1]  # incremented when readers of the file must change
     goals: Annotated[list[GoalEntry], Field(min_length=1, max_length=256)]
     noise: dict[str, Any] | None = None  # written by older versions; not used
     origin: dict[str, Any] = field(default_factory=dict)
@@ -167,8 +169,8 @@ def read_goal_folder(folder: Path) -> tuple[SubGoal, ...]:
     """Read the goals of a folder.
 
     Raises:
-        InputError: There is no goals.json, or it is invalid; or an image is not in the folder, has no contrast, cannot
-            be read, or differs in size from the first image.
+        InputError: goals.json is missing or invalid; or an image is not in the folder, has no contrast, cannot be read,
+            or differs in size from the first image.
     """
     path, needed = folder / GOALS_FILE, f"the {GOALS_FILE} that `vjepa2-ac goals` writes"
     content = parse_record(_GoalsFile, read_json_object(path, needed=needed), where=str(path), needed=needed)
@@ -209,11 +211,11 @@ def write_goals(
     frames: Sequence[int | None] = (),
     origin: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write goals into a folder, completely or not at all, and return the path of its goals.json.
+    """Write goals into a folder, all or none, and return the path of its goals.json.
 
     Args:
-        folder: A new folder, or one without goals; its other files are kept.
-        goals: In order.
+        folder: A new folder, or a folder without goals.json; its other files are kept.
+        goals: The goals in order.
         frames: Index of each goal's frame in the demonstration; empty: unknown.
         origin: The source of the goals, as plain values.
 
@@ -224,13 +226,13 @@ def write_goals(
     if not goals:
         raise ValueError("no goals")
     none = [None] * len(goals)
-    with folder_writer(folder, GOALS_FILE) as filling:
+    with folder_writer(folder, GOALS_FILE) as temporary_folder:
         entries = []
         for number, (goal, frame) in enumerate(zip(goals, frames or none, strict=True), start=1):
             name = f"goal_{number}.png"
-            (filling / name).write_bytes(encode_png(goal.image))
-            bounds = (goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper)
-            entries.append(GoalEntry(name, *bounds, frame))
+            (temporary_folder / name).write_bytes(encode_png(goal.image))
+            rule = (goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper)
+            entries.append(GoalEntry(name, *rule, frame))
         content = _GoalsFile(1, entries, origin=dict(origin or {}))
-        (filling / GOALS_FILE).write_text(format_json(asdict(content)))
+        (temporary_folder / GOALS_FILE).write_text(format_json(asdict(content)))
     return folder / GOALS_FILE

@@ -25,9 +25,9 @@ def load_for_planning(
 
     The settings of a run (planning, seed, crop, stride, dtype of the weights) are read from its config. The settings of
     a model are those of `config`, or the defaults; the default dtype is bfloat16 on a GPU that supports it, otherwise
-    float32. Limits beyond the motions in the training data, and low-diversity training data, are logged as warnings and
-    stored in the subject's `warnings`. An adapter is merged before the model moves to the device, so that the device
-    holds only one copy (see `prepare_for_planning`).
+    float32. If limits exceed the motions in the training data, or these have a low diversity, a warning is logged and
+    added to the subject's `warnings`. An adapter is merged before the model moves to the device, so that the device
+    stores only one copy (see `prepare_for_planning`).
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
@@ -54,17 +54,18 @@ def load_for_planning(
 
 
 def prepare_for_planning(world_model: WorldModel, config: PlanningConfig) -> WorldModel:
-    """Return the model for planning: the same model, or a merged copy that shares its encoder if it has an adapter.
+    """Return the model for planning: the same model, or a merged copy of a model with an adapter.
 
-    Trained weights are float32, and planning does not use autocast as training does. Unmerged, PEFT computes an adapter
-    in float32, and a fully fine-tuned predictor computes everything in float32. The merged copy computes in the dtype
-    of the base model. On a simulated GPU a decision at the released sizes in bfloat16 takes 7.5 s unmerged, 3.7 s with
-    unmerged bfloat16 adapters, and 3.0 s merged. Merging costs no accuracy: after 200 steps of the demo, the rounding
-    error of bfloat16 predictions is 2.5 % of the adapter's effect when merged, 2.7 % unmerged, and 2.4 % for the base
-    model. The updates lost to rounding (below 0.2 % of a weight) are below bfloat16's noise in the output of a layer.
+    Trained weights are float32, and planning, unlike training, does not use autocast. Without merging, PEFT computes an
+    adapter in float32, and a fully fine-tuned predictor computes everything in float32. The merged copy computes in the
+    dtype of the base model, and shares the encoder. On a simulated GPU a decision at the released sizes in bfloat16
+    takes 7.5 s unmerged, 3.7 s with unmerged bfloat16 adapters, and 3.0 s merged. Merging costs no accuracy: after 200
+    steps of the demo, the rounding error of bfloat16 predictions is 2.5 % of the adapter's effect when merged, 2.7 %
+    unmerged, and 2.4 % for the base model. The updates lost to rounding (below 0.2 % of a weight) are below bfloat16's
+    noise in the output of a layer.
 
     Raises:
-        InputError: `planning.compile` is `blocks`, and there is no compiler.
+        InputError: `planning.compile` is `blocks`, and no compiler is installed.
     """
     if world_model.adaptation is not None:
         world_model = copy_with_merged_adapter(world_model)

@@ -1,6 +1,6 @@
-"""The planner: minimises a cost function over action sequences, with a time budget and limits, and records the search.
+"""The planner: minimises a cost over action sequences, within a time budget and limits, and records the search.
 
-Tensor axes: samples (action sequences), decisions (actions that are chosen), steps (model steps; each decision is
+Tensor dimensions: samples (action sequences), decisions (actions that are chosen), steps (model steps; each decision is
 repeated for `SearchSpace.repeat` of them), dim (components of an action). All tensors are on the CPU.
 """
 
@@ -37,14 +37,14 @@ class SearchCancelledError(Exception):
 
 @runtime_checkable
 class Cost(Protocol):
-    """The interface between planner and model: the cost of action sequences. Lower is better; NaN is not allowed.
+    """The interface between planner and model: the cost of action sequences. Lower is better.
 
-    A cost that evaluates in parts may have an attribute `progress`, which it calls after each part with the number of
-    evaluated action sequences and the total of the call.
+    Action sequences whose cost is not finite are never selected. A cost that evaluates in batches may have an attribute
+    `progress`, which it calls after each batch with the number of evaluated action sequences and the total of the call.
     """
 
     def __call__(self, actions: Float[Tensor, "samples steps dim"]) -> Float[Tensor, " samples"]:
-        """Return the energy of each action sequence; for `gradient`, as a differentiable function of it."""
+        """Return the energy of each action sequence; the planner `gradient` differentiates it."""
         ...
 
 
@@ -60,28 +60,28 @@ def make_cancellation_check(cancelled: Cancelled, progress: Progress = no_progre
 
 
 @contextmanager
-def report_progress(cost: Cost, progress: Progress, *, done: int, share: int, total: int) -> Iterator[None]:
-    """Report the progress of the evaluation in a `with` block: after each part that the cost reports, and at the end.
+def report_progress(cost: Cost, progress: Progress, *, num_before: int, num_added: int, total: int) -> Iterator[None]:
+    """Report the progress of the evaluation in a `with` block: after each batch that the cost reports, and at the end.
 
     Args:
         cost: The cost that is evaluated.
         progress: Called with the number of evaluated action sequences and the total.
-        done: Number before this evaluation.
-        share: Number that this evaluation adds to `done`; it may differ from its number of action sequences.
-        total: Number for all evaluations.
+        num_before: Number of action sequences before this evaluation.
+        num_added: Number that this evaluation adds; action sequences that a planner reuses are not counted.
+        total: Number of all evaluations.
     """
 
-    def report_part(part: int, part_total: int) -> None:
-        if part < part_total:  # the end is reported after the `with` block, when the energies have been computed
-            progress(done + share * part // part_total, total)
+    def report_batch(done: int, call_total: int) -> None:
+        if done < call_total:  # the end is reported after the `with` block, when the energies have been computed
+            progress(num_before + num_added * done // call_total, total)
 
-    parts: Any = cost if hasattr(cost, "progress") else SimpleNamespace(progress=no_progress)
-    previous, parts.progress = parts.progress, report_part
+    reporting_cost: Any = cost if hasattr(cost, "progress") else SimpleNamespace(progress=no_progress)
+    previous, reporting_cost.progress = reporting_cost.progress, report_batch
     try:
         yield
     finally:
-        parts.progress = previous
-    progress(done + share, total)
+        reporting_cost.progress = previous
+    progress(num_before + num_added, total)
 
 
 @dataclass(frozen=True)
@@ -109,10 +109,10 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Plan:
-    """The planned actions, and a record of their search."""
+    """The planned actions, and a record of the search."""
 
     actions: Float[Tensor, "steps dim"]  # always within the limits; zero if `stopped` is "no finite energy"
-    energy: float  # of these actions; NaN if `stopped` is "no finite energy"
+    energy: float  # predicted for `actions`; NaN if `stopped` is "no finite energy"
     stopped: Stopped  # why the search ended
     iterations: tuple[Iteration, ...]
     mean: Float[Tensor, "decisions dim"]  # final mean of the search, before the gripper is rounded
@@ -125,8 +125,8 @@ class Plan:
     def make_next_start(self) -> PlanStart:
         """Return the start of the next search, one model step later.
 
-        Each decision starts at the mean of this plan's actions in the same model steps. If actions are repeated, such
-        model steps can belong to two decisions of this plan. The last action is repeated.
+        Each new decision starts at the mean of this plan's actions in the same model steps. If actions are repeated,
+        these steps may belong to two decisions of this plan. After the end of this plan its last action is repeated.
         """
         elites = self.iterations[-1].elites if self.iterations else self.mean[None][:0]
         return PlanStart(_shift_by_step(self.mean[None], self.repeat)[0], _shift_by_step(elites, self.repeat))
@@ -143,19 +143,19 @@ def _shift_by_step(decisions: Samples, repeat: int) -> Samples:
 def count_samples_per_iteration(config: PlanningConfig) -> tuple[int, ...]:
     """Return the number of new action sequences that each iteration evaluates, without those that icem reuses."""
     zeros = torch.zeros(1, 1)
-    search = _make_solver(config, SearchSpace(zeros, zeros, zeros), Generator(), PlanStart(zeros, zeros[None]))
-    return _count_samples(search, config)
+    solver = _make_solver(config, SearchSpace(zeros, zeros, zeros), Generator(), PlanStart(zeros, zeros[None]))
+    return _count_samples(solver, config)
 
 
 def _make_solver(config: PlanningConfig, space: SearchSpace, generator: Generator, start: PlanStart | None) -> Solver:
     name, options = config.planner.name, config.planner.options
-    search: Solver = PLANNERS.find(name)(space, config, generator, start, **PLANNERS.options(name, options))
-    return search
+    solver: Solver = PLANNERS.find(name)(space, config, generator, start, **PLANNERS.options(name, options))
+    return solver
 
 
-def _count_samples(search: Solver, config: PlanningConfig) -> tuple[int, ...]:
+def _count_samples(solver: Solver, config: PlanningConfig) -> tuple[int, ...]:
     """Return the number of samples of each iteration; a third-party solver need not have `num_samples`."""
-    number = getattr(search, "num_samples", lambda _: config.samples)
+    number = getattr(solver, "num_samples", lambda _: config.samples)
     return tuple(itertools.takewhile(bool, map(number, range(config.iterations))))
 
 
@@ -170,7 +170,7 @@ class Planner:
         space: The allowed actions; None: an arm's actions within `planning.limits`.
         clock: Measures the time budget.
         progress: Called with the number of evaluated action sequences and the total: at the start of a search, after
-            each part that the cost reports, and after each iteration.
+            each batch that the cost reports, and after each iteration.
     """
 
     config: PlanningConfig
@@ -186,14 +186,14 @@ class Planner:
         cancelled: Cancelled = lambda: False,
         space: SearchSpace | None = None,
     ) -> Plan:
-        """Return the best plan found.
+        """Search for a plan, and return it.
 
         Args:
-            cost: The cost of action sequences. Called without gradients except by planner gradient.
-            generator: On the CPU; the same seed gives the same plan. Its initial seed is recorded.
+            cost: The cost of action sequences. It is called without gradients, except by the planner `gradient`.
+            generator: A random generator on the CPU. The same seed gives the same plan; the plan records the seed.
             start: Start of the search, from the previous plan (`Plan.make_next_start`), a prior or a policy; None: zero
                 motion.
-            cancelled: Called before every iteration, and after each part that the cost reports; returns whether to
+            cancelled: Called before every iteration, and after each batch that the cost reports; returns whether to
                 stop.
             space: The allowed actions, with the planner's number of decisions; None: those of the planner.
 
@@ -203,23 +203,25 @@ class Planner:
         """
         started_s, config = self.clock(), self.config
         space = space or self.space or make_pose_search_space(config)
-        search = _make_solver(config, space, generator, start)
+        solver = _make_solver(config, space, generator, start)
         record: list[Iteration] = []
-        shares = _count_samples(search, config)
-        total = sum(shares)
+        counts = _count_samples(solver, config)  # by iteration
+        total = sum(counts)
         self.progress(0, total)
-        while len(record) < len(shares):
+        while len(record) < len(counts):
             longest = max((iteration.seconds for iteration in record), default=0.0)
             if record and config.budget_s is not None and self.clock() - started_s + longest > config.budget_s:
                 break
             if cancelled():
                 raise SearchCancelledError
-            done, share = sum(shares[: len(record)]), shares[len(record)]
+            num_before, num_added = sum(counts[: len(record)]), counts[len(record)]
             report = make_cancellation_check(cancelled, self.progress)
-            with report_progress(cost, report, done=done, share=share, total=total):
-                record.append(self._run_iteration(search, cost, space))
-        stopped: Stopped = "finished" if len(record) == len(shares) else "out of time"
-        actions, energy, evaluated = _select_plan(search.result(), record, cost, space, lowest=stopped == "out of time")
+            with report_progress(cost, report, num_before=num_before, num_added=num_added, total=total):
+                record.append(self._run_iteration(solver, cost, space))
+        stopped: Stopped = "finished" if len(record) == len(counts) else "out of time"
+        actions, energy, num_extra = _select_plan(
+            solver.result(), record, cost, space, take_lowest=stopped == "out of time"
+        )
         if actions is None:
             actions, stopped = torch.zeros(space.steps, space.dim), "no finite energy"
         return Plan(
@@ -227,22 +229,22 @@ class Planner:
             energy=energy,
             stopped=stopped,
             iterations=tuple(record),
-            mean=search.mean,
+            mean=solver.mean,
             repeat=space.repeat,
             planner=config.planner.name,
             seed=generator.initial_seed(),
-            evaluations=sum(iteration.samples for iteration in record) + evaluated,
+            evaluations=sum(iteration.samples for iteration in record) + num_extra,
             seconds=self.clock() - started_s,
         )
 
-    def _run_iteration(self, search: Solver, cost: Cost, space: SearchSpace) -> Iteration:
+    def _run_iteration(self, solver: Solver, cost: Cost, space: SearchSpace) -> Iteration:
         started_s = self.clock()
-        decisions = search.sample()
-        plans = _evaluate(cost, decisions, space, gradients=search.uses_gradients)
-        best = plans.select_best(search.elites)
-        search.update(plans)
+        decisions = solver.sample()
+        plans = _evaluate(cost, decisions, space, gradients=solver.uses_gradients)
+        best = plans.select_best(solver.elites)
+        solver.update(plans)
         counts = len(decisions), len(plans.energies)
-        return Iteration(*counts, best.decisions, best.energies, search.mean, search.std, self.clock() - started_s)
+        return Iteration(*counts, best.decisions, best.energies, solver.mean, solver.std, self.clock() - started_s)
 
 
 def _evaluate(cost: Cost, decisions: Samples, space: SearchSpace, *, gradients: bool) -> EvaluatedPlans:
@@ -261,23 +263,23 @@ def _evaluate(cost: Cost, decisions: Samples, space: SearchSpace, *, gradients: 
 
 
 def _select_plan(
-    result: Tensor | None, record: list[Iteration], cost: Cost, space: SearchSpace, *, lowest: bool
+    result: Tensor | None, record: list[Iteration], cost: Cost, space: SearchSpace, *, take_lowest: bool
 ) -> tuple[Float[Tensor, "steps dim"] | None, float, int]:
     """Return actions, their energy, and the number of extra evaluations.
 
-    The actions are the solver's result, or the best sample if the result has no finite energy. With `lowest` (a search
-    that was stopped early) they are the one with the lower energy, since the mean may still be close to its start.
+    The actions are the solver's result, or the best sample if the result has no finite energy. With `take_lowest`
+    the one with the lower energy is selected, because after an early stop the mean may still be close to its start.
     """
     best_iteration = min(record, key=lambda iteration: iteration.lowest)
     best = best_iteration.elites[0] if len(best_iteration.elites) else None
-    chosen, lowest_energy, evaluated = None, math.nan, 0
+    chosen, lowest_energy, num_extra = None, math.nan, 0
     for decisions in (result, best):
-        if decisions is None or (chosen is not None and not lowest):
+        if decisions is None or (chosen is not None and not take_lowest):
             continue
         finished, energies = space.finalize(decisions), [best_iteration.lowest]
         if decisions is not best or not torch.equal(finished, decisions):
             energies = _evaluate(cost, finished[None], space, gradients=False).energies.tolist()
-            evaluated += 1
+            num_extra += 1
         if energies and not energies[0] >= lowest_energy:
             chosen, lowest_energy = space.repeat_over_steps(finished), energies[0]
-    return chosen, lowest_energy, evaluated
+    return chosen, lowest_energy, num_extra

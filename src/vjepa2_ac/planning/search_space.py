@@ -1,4 +1,4 @@
-"""The search space of actions: limits per axis and of the L1 norm, fixed axes, the gripper's rounding, a workspace."""
+"""The search space of actions: limits of each component and of the L1 norm, rounding of the gripper, a workspace."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _ROUNDING = 4 * torch.finfo(torch.float32).eps  # margin for the rounding errors
 
 @dataclass(frozen=True)
 class SearchSpace:
-    """Limits of each component of each decision; a component whose two limits are equal is fixed.
+    """Lower and upper limits of each component of each decision; a component whose limits are equal is fixed.
 
-    The limits are finite, and no lower limit is above its upper limit. With `l1` they allow zero motion.
+    The limits are finite, and no lower limit is above its upper limit. If `l1` is set, they include zero motion.
     """
 
     lower: Float[Tensor, "decisions dim"]
     upper: Float[Tensor, "decisions dim"]
-    std: Float[Tensor, "decisions dim"]  # of the first samples, before it is scaled by a planner's `start_std`
-    repeat: int = 1  # model steps of a decision
+    std: Float[Tensor, "decisions dim"]  # standard deviation of the first samples; planners scale it by `start_std`
+    repeat: int = 1  # number of model steps for which a decision is repeated
     l1: float | None = None  # the largest sum of the absolute dx, dy and dz
     gripper: int | None = None  # index of the gripper in an action; None: unknown
-    gripper_rounding: float = 0.0  # changes below this are set to zero in a finished plan
+    gripper_rounding: float = 0.0  # in a finished plan smaller changes are set to zero
 
     @property
     def decisions(self) -> int:
@@ -50,7 +50,7 @@ class SearchSpace:
 
     @property
     def free(self) -> Tensor:
-        """Indices of the components that are not fixed in at least one decision."""
+        """Indices of the components that at least one decision can change."""
         return (self.lower < self.upper).any(dim=0).nonzero()[:, 0]
 
     @property
@@ -59,7 +59,7 @@ class SearchSpace:
         return torch.where(self.lower < self.upper, self.std, 0.0)
 
     def clip(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch decisions dim"]:
-        """Return each decision, clipped to the limits; the result is always allowed, and NaN becomes the allowed zero.
+        """Return decisions clipped to the limits; NaN becomes the allowed value that is closest to zero.
 
         If dx, dy and dz exceed the limit of the L1 norm, they are scaled down together.
         """
@@ -68,11 +68,11 @@ class SearchSpace:
             return clipped
         length = clipped[..., :3].abs().sum(dim=-1, keepdim=True)
         length = length.clamp(min=torch.finfo(length.dtype).tiny)  # avoids a division by zero
-        share = (self.l1 * (1 - _ROUNDING) / length).clamp(max=1.0)
-        return torch.cat([clipped[..., :3] * share, clipped[..., 3:]], dim=-1)
+        scale = (self.l1 * (1 - _ROUNDING) / length).clamp(max=1.0)
+        return torch.cat([clipped[..., :3] * scale, clipped[..., 3:]], dim=-1)
 
     def finalize(self, decisions: Float[Tensor, "decisions dim"]) -> Float[Tensor, "decisions dim"]:
-        """Return decisions as a robot receives them: allowed, with small changes of the gripper rounded to zero.
+        """Return decisions as a robot receives them: within the limits, with small gripper changes set to zero.
 
         Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, round_small_elements.
         """
@@ -111,13 +111,13 @@ def make_pose_search_space(config: PlanningConfig) -> SearchSpace:
     """Return the allowed actions of an arm: dx, dy, dz, three rotations, gripper (see `vjepa2_ac.episode`)."""
     limits, decisions = config.limits, config.horizon // config.action_repeat
     gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
-    reach = _round_towards_zero([*limits.xyz_m, *[limits.rotation] * 3, gripper])
-    upper = reach.repeat(decisions, 1)
+    largest = _round_towards_zero([*limits.xyz_m, *[limits.rotation] * 3, gripper])
+    upper = largest.repeat(decisions, 1)
     lower = -upper
     if limits.gripper_mode in {"open", "close"}:
         lower[:, GRIPPER] = upper[:, GRIPPER] = 1.0 if limits.gripper_mode == "close" else -1.0
-    std = reach.clone()
-    std[GRIPPER] = 1.0  # as upstream: larger than the gripper's limit, so that many samples are clipped to the limit
+    std = largest.clone()
+    std[GRIPPER] = 1.0  # as upstream: many samples exceed the gripper's limit and are clipped to it
     return SearchSpace(
         lower=lower,
         upper=upper,
@@ -130,7 +130,7 @@ def make_pose_search_space(config: PlanningConfig) -> SearchSpace:
 
 
 def _round_towards_zero(values: list[float]) -> Float[Tensor, " dim"]:
-    """Return values in float32, rounded towards zero, so that no limit is exceeded: float32's 0.05 is above 0.05."""
+    """Return values in float32, rounded towards zero: the float32 number nearest to 0.05 exceeds a limit of 0.05."""
     exact = torch.tensor(values, dtype=torch.float64)
     nearest = exact.float()
     return torch.where(nearest.double() > exact, torch.nextafter(nearest, torch.zeros_like(nearest)), nearest)
@@ -141,17 +141,17 @@ _NEAR_M = 1e-8  # metres; the rounding error of float32 actions, far below the r
 
 @dataclass(frozen=True)
 class Workspace:
-    """A box that contains all positions that the flange may reach."""
+    """The box in which the flange must stay."""
 
     low: Float[np.ndarray, " 3"]
     high: Float[np.ndarray, " 3"]
 
     @classmethod
     def from_limits(cls, limits: LimitsConfig, space: StateSpace) -> Workspace | None:
-        """Return the box of `planning.limits.workspace`; None: there is none.
+        """Return the box of `planning.limits.workspace`; None: no box is set.
 
         Raises:
-            InputError: States are not poses in the base frame.
+            InputError: The states are not poses in the base frame.
         """
         if limits.workspace is None:
             return None
@@ -162,10 +162,10 @@ class Workspace:
         return cls(*(np.array(corner, dtype=np.float64) for corner in limits.workspace))
 
     def narrow(self, space: SearchSpace, state: Float[np.ndarray, " 7"]) -> SearchSpace:
-        """Return a search space whose first decision stays inside the box in each model step of its repetition.
+        """Return a search space in which the first decision, including its repetitions, stays inside the box.
 
-        From a position outside along an axis, motions farther outwards are excluded. `clip_actions` adds the motion
-        inwards.
+        If the position is outside the box along an axis, motions further out are excluded. `clip_actions` adds the
+        motion back into the box.
         """
         lower, upper = space.lower.clone(), space.upper.clone()
         lowest = torch.from_numpy(np.minimum(self.low - state[:3], 0.0)).float() / space.repeat
@@ -179,9 +179,9 @@ class Workspace:
     ) -> Float[np.ndarray, "steps 7"]:
         """Return actions whose target positions are all inside the box.
 
-        The robot must be inside, or near enough for one action to bring it inside. A target outside is moved to the
-        nearest position inside. If the action then exceeds its limits, it is shortened towards the shortest motion that
-        ends inside.
+        The robot must be inside, or near enough for one action to bring it inside. A target outside the box is replaced
+        by the nearest position inside. If the action then exceeds its limits, it is shortened so that it still ends
+        inside.
 
         Args:
             state: The state of the robot.
@@ -189,31 +189,33 @@ class Workspace:
             limits: The limits of an action.
         """
         clipped, position = np.array(actions, dtype=np.float64), np.array(state[:3], dtype=np.float64)
-        reach = np.array(limits.xyz_m)
+        largest = np.array(limits.xyz_m)
         for action in clipped:
             motion = np.clip(position + action[:3], self.low, self.high) - position
             if abs(motion - action[:3]).max() > _NEAR_M:
-                action[:3] = _shorten_to_l1(np.clip(motion, -reach, reach), self.get_return_motion(position), limits.l1)
+                action[:3] = _shorten_to_l1(
+                    np.clip(motion, -largest, largest), self.get_return_motion(position), limits.l1
+                )
             position = position + action[:3]
         return clipped
 
     def get_return_motion(self, position: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Return the shortest motion that ends inside the box; zeros for a position inside."""
+        """Return the shortest motion from a position into the box; zeros for a position inside."""
         return np.asarray(np.clip(position, self.low, self.high) - position)
 
 
 def _shorten_to_l1(
     motion: Float[np.ndarray, " 3"], shortest: Float[np.ndarray, " 3"], l1: float | None
 ) -> Float[np.ndarray, " 3"]:
-    """Return a motion whose L1 norm is within its limit, and that still ends inside the workspace.
+    """Return a motion into the workspace, shortened to the limit of its L1 norm so that it still ends inside.
 
-    Only the part beyond the shortest motion inside is scaled: both parts have the same direction along each axis, so
-    that their L1 norms add up.
+    Only the difference from `shortest` is scaled. It has the same sign as `shortest` along each axis, so their L1 norms
+    add up to that of the motion.
 
     Args:
         motion: From a position to a position inside.
         shortest: The shortest motion from the same position to a position inside; within the limit.
-        l1: The limit; None: there is none.
+        l1: The limit of the L1 norm in metres; None: no limit.
     """
     if l1 is None:
         return motion
@@ -223,7 +225,7 @@ def _shorten_to_l1(
 
 
 def is_within_limits(motion: Float[np.ndarray, "*batch 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
-    """Return whether motions of the flange are within the limits of each axis and of the L1 norm."""
+    """Return whether motions of the flange are within the limits along each axis and of the L1 norm."""
     max_l1 = np.inf if limits.l1 is None else limits.l1
     return bool(
         (abs(motion) <= np.array(limits.xyz_m) + slack_m).all() and (abs(motion).sum(-1) <= max_l1 + slack_m).all()

@@ -27,20 +27,20 @@ USED_KEYS = (
     "planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype",
     "training.device", *MOVABLE_PATHS,
 )  # fmt: skip
-_ANY_TYPE = "training.precision=bf16"  # allows any model.dtype: the rule about autocast is not relevant to planning
-_SLACK = 1.1  # the 99th percentile of uniform motion is below its maximum, and is inexact for few episodes
+_ANY_DTYPE = "training.precision=bf16"  # with it any model.dtype is valid; planning does not use the precision
+_SLACK = 1.1  # limits may exceed the 99th percentile by 10 %, since it is below the maximum and inexact
 
 
 def load_planning_config(
     subject: str, *, config: str | Path | None = None, overrides: Sequence[str] = (), dtype: str = "float32"
 ) -> Config:
-    """Return the config for planning: the run's config; for a model the given config, or the defaults.
+    """Return the config for planning: that of the run, or for a model the given config or the defaults.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
         config: A config file, for a model.
         overrides: For example planning.horizon=2.
-        dtype: dtype of the weights of a model, if there is no config.
+        dtype: dtype of a model's weights if no config is given.
 
     Raises:
         InputError: A setting is invalid, or is not used for planning.
@@ -52,11 +52,11 @@ def load_planning_config(
             fix = "Leave --config out, and override single settings with key=value"
             raise InputError(where=f"--config {config}", found=problem, fix=fix)
         folder = Path(subject)
-        settings = resolve_data_limits(read_run_config(folder, [*overrides, _ANY_TYPE]), folder)
+        settings = resolve_data_limits(read_run_config(folder, [*overrides, _ANY_DTYPE]), folder)
     elif config is None:
         settings = config_of_model(subject, overrides, dtype=dtype)
     else:
-        settings = load_config(config, [*overrides, _ANY_TYPE])
+        settings = load_config(config, [*overrides, _ANY_DTYPE])
         settings = settings.model_copy(update={"model": settings.model.with_base(subject)})
     require_limits(settings)
     if (axes := settings.planning.axes) is not None:
@@ -67,7 +67,7 @@ def load_planning_config(
 
 # ---- calibrated axes ----
 
-AXES_FILE, AXES_FORMAT = "axes.json", 1  # the format is incremented when a reader of the file would have to change
+AXES_FILE, AXES_FORMAT = "axes.json", 1  # the format is incremented when readers of the file must change
 _FIX = "Fit them with `vjepa2-ac data calibrate CONFIG --axes MODEL`, and name the axes.json that it writes"
 
 
@@ -77,10 +77,10 @@ class AxesFile(BaseModel):
     format: Literal[1]
     # Rotation about z, counterclockwise seen from above, from executed actions to the actions that the model infers.
     yaw_degrees: float = Field(validation_alias=AliasPath("yaw_degrees", "value"), allow_inf_nan=False)
-    subject: str = Field(validation_alias=AliasPath("model", "subject"))  # the model, as given
-    encoder: str = Field(validation_alias=AliasPath("model", "encoder"))  # hashes of its weights
-    predictor: str = Field(validation_alias=AliasPath("model", "predictor"))
-    problem: str | None  # why these axes cannot be used; None: they can
+    subject: str = Field(validation_alias=AliasPath("model", "subject"))  # run or model, as on the command line
+    encoder: str = Field(validation_alias=AliasPath("model", "encoder"))  # hash of the weights
+    predictor: str = Field(validation_alias=AliasPath("model", "predictor"))  # hash of the weights
+    problem: str | None  # why planning cannot use these axes; None: no problem
     centre_m: tuple[float, float] = (0.0, 0.0)  # x, y of the rotation axis
 
 
@@ -100,10 +100,10 @@ def read_axes(path: str | Path) -> AxesFile:
 
 
 def require_base_frame(where: str, *, is_base: bool) -> None:
-    """Refuse states that are not poses in the robot's base frame: only these have a vertical axis to rotate about.
+    """Refuse states that are not poses in the robot's base frame; calibrated axes rotate about its vertical axis.
 
     Raises:
-        InputError: The states are not such poses.
+        InputError: The states are not poses in this frame.
     """
     if not is_base:
         needed = "data.states: pose and data.pose_frame: base"
@@ -145,12 +145,12 @@ def _require_relevant(subject: str, overrides: Sequence[str]) -> None:
 
 
 def require_limits(config: Config) -> None:
-    """Refuse `planning.limits.xyz: data` for poses if no run recorded the motions in its data.
+    """Refuse `planning.limits.xyz: data` for poses if no recorded motions replaced it (`resolve_data_limits`).
 
     `make_search_space` checks the limits of vectors.
 
     Raises:
-        InputError: As `LimitsConfig.xyz_m`.
+        InputError: As for `LimitsConfig.xyz_m`.
     """
     if config.data.states == "pose":
         _ = config.planning.limits.xyz_m
@@ -162,12 +162,12 @@ class DataLimits:
 
     # 99th percentile of the absolute change of each number in a model step
     changes: tuple[Annotated[float, Field(ge=0.0, allow_inf_nan=False)], ...]
-    # why the data have a low diversity; empty: they do not, or this is unknown
+    # why the diversity of the data is low; empty: it is not low, or it is unknown
     low_diversity: str = ""
 
 
 def read_data_limits(folder: Path, *, is_pose: bool) -> DataLimits | None:
-    """Read the statistics of the motions in a run's training data; None: the run has none, as older runs of poses.
+    """Read the statistics of the motions in a run's training data; None: an older version wrote the run without them.
 
     Raises:
         InputError: The file is invalid.
@@ -197,7 +197,7 @@ def resolve_data_limits(config: Config, folder: Path) -> Config:
         data_limits := read_data_limits(folder, is_pose=is_pose)
     ) is None:
         return config
-    # Rounded down to 0.1 mm, so that an axis with nothing but measurement noise is fixed.
+    # Rounded down to 0.1 mm, so that a component that contains only measurement noise is fixed.
     metres = tuple(math.floor(1e4 * change) / 1e4 for change in data_limits.changes[:3])
     numbers = {"xyz": metres} if is_pose else {"axes": data_limits.changes}
     planning = config.planning.model_copy(update={"limits": limits.model_copy(update=numbers)})
@@ -207,7 +207,7 @@ def resolve_data_limits(config: Config, folder: Path) -> Config:
 def warn_if_limits_exceed_data(config: Config, folder: Path) -> tuple[str, ...]:
     """Log and return warnings if a run was trained on low-diversity data, or if the limits exceed the data's motions.
 
-    Each limit is compared with the 99th percentile of each number's change, which it may exceed by 10 %.
+    Each limit may exceed the 99th percentile of the recorded changes by 10 %.
 
     Args:
         config: The config of the run, with the limits for planning.
@@ -225,11 +225,11 @@ def warn_if_limits_exceed_data(config: Config, folder: Path) -> tuple[str, ...]:
         else []
     )
     names = POSE.change_names if is_pose else make_vector_states(len(data_limits.changes)).names
-    reach = _largest_changes(config.planning.limits, data_limits, is_pose=is_pose)
+    limits = _largest_changes(config.planning.limits, data_limits, is_pose=is_pose)
     for key, (unit, factor, numbers) in (_POSE_LIMITS if is_pose else _VECTOR_LIMITS).items():
         exceeded = [
             f"{name} {factor * limit:.3g} ({factor * change:.3g}){unit}"
-            for name, limit, change in list(zip(names, reach, data_limits.changes, strict=False))[numbers]
+            for name, limit, change in list(zip(names, limits, data_limits.changes, strict=False))[numbers]
             if limit > _SLACK * change
         ]
         if exceeded:
@@ -253,10 +253,10 @@ _VECTOR_LIMITS = {"axes": ("", 1.0, slice(None))}
 
 
 def _largest_changes(limits: LimitsConfig, data_limits: DataLimits, *, is_pose: bool) -> Sequence[float]:
-    """Return the largest change of each number in a model step; empty if the limits do not define one for each."""
+    """Return the limit of each number's change in a model step; empty if the number of limits is wrong."""
     if not is_pose:
-        axes = limits.axes if isinstance(limits.axes, tuple) else data_limits.changes
-        axes = axes * len(data_limits.changes) if len(axes) == 1 else axes
-        return axes if len(axes) == len(data_limits.changes) else ()
+        largest = limits.axes if isinstance(limits.axes, tuple) else data_limits.changes
+        largest = largest * len(data_limits.changes) if len(largest) == 1 else largest
+        return largest if len(largest) == len(data_limits.changes) else ()
     gripper = limits.gripper if limits.gripper_mode in {"rounded", "free"} else 0.0
     return [*limits.xyz_m, *[limits.rotation] * 3, gripper]

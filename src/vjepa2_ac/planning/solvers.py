@@ -1,7 +1,7 @@
-"""Solvers, which search for the action sequence of lowest cost: CEM, iCEM, MPPI, gradient descent.
+"""Solvers: CEM, iCEM, MPPI and gradient descent search for the action sequence of lowest energy.
 
-A solver proposes decisions, receives their energies, and returns a result; `planning.planner` runs the loop. A custom
-solver has the constructor, the attributes and the methods of `Solver`, but need not inherit from it
+A solver proposes decisions, receives their energies, and returns a result; `planning.planner` runs the loop. A
+third-party solver has the constructor, the attributes and the methods of `Solver`, but need not inherit from it
 (docs/extending.md). Its options are the fields of its class `Config`.
 """
 
@@ -21,7 +21,7 @@ from vjepa2_ac.config.section import Positive, PositiveInt, Section, Share, Zero
 from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.search_space import SearchSpace
 
-_MIN_PRIOR_STD = 0.1  # lower bound on the std from a prior, relative to the planner's; a prior is overconfident
+_MIN_PRIOR_STD = 0.1  # lower bound on a prior's std, as a fraction of the planner's, since priors are overconfident
 Momentum = float | Tensor  # share of the old mean or standard deviation in the new one
 Elites = Annotated[int, Field(ge=2)]
 
@@ -32,11 +32,11 @@ class PlanStart:
 
     mean: Float[Tensor, "decisions dim"]
     elites: Float[Tensor, "elites decisions dim"]
-    std: Float[Tensor, "decisions dim"] | None = None  # None: the planner's
+    std: Float[Tensor, "decisions dim"] | None = None  # None: the planner's own
 
     @classmethod
     def from_samples(cls, samples: Float[Tensor, "samples steps dim"], space: SearchSpace) -> PlanStart:
-        """Return the mean and the standard deviation of actions that a policy proposes.
+        """Return a start at the mean of actions that a policy proposes, with their standard deviation.
 
         Raises:
             InputError: The actions have fewer model steps than a plan, or another number of components.
@@ -57,11 +57,11 @@ Samples = Float[Tensor, "samples decisions dim"]
 
 @dataclass(frozen=True)
 class EvaluatedPlans:
-    """Decisions with their energies; those without a finite energy are left out, so there may be none."""
+    """Decisions with a finite energy, possibly none, and their energies."""
 
     decisions: Float[Tensor, "finite decisions dim"]
     energies: Float[Tensor, " finite"]
-    gradients: Samples | None = None  # for all samples; 0 where the energy is not finite
+    gradients: Samples | None = None  # of all evaluated samples; 0 where the energy is not finite
 
     def select_best(self, count: int) -> EvaluatedPlans:
         """Return the decisions of lowest energy, best first; fewer if there are not enough."""
@@ -70,19 +70,19 @@ class EvaluatedPlans:
 
 
 class Solver:
-    """The search of one decision, from its first samples to its result.
+    """The search for one plan, from the first samples to the result.
 
     Args:
         space: The allowed decisions.
         config: Settings for planning.
         generator: Random generator of the samples.
         start: The start of the search; None: zero motion.
-        options: The solver's options, an instance of its `Config`, if it has one.
+        options: An instance of the solver's `Config`; None if it has no options.
     """
 
     uses_gradients = False
-    Config: type[BaseModel] | None = None  # the class of the options, if there are any
-    mean: Float[Tensor, "decisions dim"]  # of the distribution
+    Config: type[BaseModel] | None = None  # the class of the options; None: no options
+    mean: Float[Tensor, "decisions dim"]  # of the distribution from which samples are drawn
     std: Float[Tensor, "decisions dim"]
 
     def __init__(
@@ -106,22 +106,22 @@ class Solver:
         return int(getattr(self._options, "elites", ELITES))
 
     def begin(self, start: OptionalStart) -> None:
-        """Prepare the search from its start."""
+        """Prepare the search. The constructor calls this method last."""
 
     def num_samples(self, iteration: int) -> int:  # noqa: ARG002 - the same in all iterations
         """Return the number of new decisions that an iteration (from 0) evaluates; 0 ends the search."""
         return self._config.samples
 
     def sample(self) -> Samples:
-        """Return the next decisions to evaluate, all allowed."""
+        """Return the next decisions to evaluate, all within the limits."""
         raise NotImplementedError
 
     def update(self, evaluated: EvaluatedPlans) -> None:
-        """Update the distribution; without any finite energy it must not change."""
+        """Update the distribution; it must not change if no energy is finite."""
         raise NotImplementedError
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
-        """Return the current result; None: the best evaluated decisions."""
+        """Return the current result; None: the planner uses the best evaluated decisions."""
         return None
 
     def _fill_action(self, value: float, *, gripper: float) -> Float[Tensor, " dim"]:
@@ -147,9 +147,10 @@ class Solver:
 
 
 def draw_white_noise(space: SearchSpace, samples: int, generator: Generator) -> Samples:
-    """Return independent standard normal numbers, zero on axes that are fixed in all decisions.
+    """Return independent standard normal numbers, zero for components that are fixed in all decisions.
 
-    Drawn decision by decision and for free axes only, in upstream's order: the same seed gives upstream's samples.
+    The numbers are drawn in upstream's order (decision by decision, free components only), so that the same seed gives
+    upstream's samples.
     """
     noise = torch.zeros(samples, space.decisions, space.dim)
     for decision in range(space.decisions):
@@ -158,17 +159,17 @@ def draw_white_noise(space: SearchSpace, samples: int, generator: Generator) -> 
 
 
 class Sampling(Section):
-    """Options of all planners that draw samples."""
+    """Options of the planners that draw samples."""
 
     start_std: Positive = 1.0
-    """Standard deviation of the first samples, as a share of the limits of position and rotation."""
+    """Standard deviation of the first samples, as a fraction of the limits of position and rotation."""
 
 
 class CemSolver(Solver):
-    """CEM as upstream: samples are clipped; mean and standard deviation move towards the elites with a momentum.
+    """CEM as upstream: samples are clipped, and mean and standard deviation move towards the elites with a momentum.
 
     Differences from upstream: a warm start is possible, samples without a finite energy are never elites, and a fixed
-    gripper has its exact value in the result, too.
+    gripper has its exact value in the result as well.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, cem.
     """
@@ -190,7 +191,7 @@ class CemSolver(Solver):
         """Whether the mean itself replaces an iteration's first sample (facebookresearch/jepa-wms)."""
 
     def sample(self) -> Samples:
-        """Return samples of the distribution, clipped to the allowed set."""
+        """Return samples of the distribution, clipped to the limits."""
         return self._sample_around_mean(try_mean=self._options.try_mean)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
@@ -208,8 +209,8 @@ class CemSolver(Solver):
 class IcemSolver(Solver):
     """Improved CEM: fewer samples in each iteration, reused elites, and coloured noise; the result is the best sample.
 
-    With `warm_start` elites are also shifted into the next decision. The last iteration also evaluates the mean. The
-    components of an action are independent; the decisions of a plan are correlated.
+    With `warm_start` the next search also reuses elites, shifted by one model step. The last iteration also evaluates
+    the mean. The noise is correlated along the plan, but independent between the components of an action.
 
     Source: Pinneri et al., Sample-efficient Cross-Entropy Method for Real-time Planning, arXiv 2008.06389, algorithm 1.
     """
@@ -222,19 +223,19 @@ class IcemSolver(Solver):
         momentum: Share = 0.1
         """Share of the old mean and standard deviation in the new ones."""
         noise_exponent: Annotated[float, Field(ge=0.0, le=8.0)] = 2.0
-        """Power spectrum 1 / frequency^exponent along the plan: 0 is white noise, larger values are smoother."""
+        """Exponent of the noise's power spectrum, 1 / frequency^exponent along the plan. 0: white; larger: smoother."""
         shrink: Annotated[float, Field(ge=1.0)] = 1.25
         """Factor by which the number of samples decreases per iteration, down to twice the number of elites."""
         kept: ZeroToOne = 0.3
         """Share of the elites that are reused, in the next iteration and, with warm_start, in the next decision."""
 
     def begin(self, start: OptionalStart) -> None:
-        """Reuse the elites of the previous decision."""
+        """Reuse the elites of the start, if there is one."""
         self._iteration = 0
         self._reused = self.mean[None][:0] if start is None else self._select_reused(start.elites)
 
     def num_samples(self, iteration: int) -> int:
-        """Return the number of new decisions, which decreases in each iteration."""
+        """Return the number of new decisions, which decreases with each iteration."""
         return max(int(self._config.samples * self._options.shrink**-iteration), 2 * self.elites)
 
     def sample(self) -> Samples:
@@ -261,29 +262,31 @@ class IcemSolver(Solver):
 
 
 def draw_coloured_noise(samples: int, decisions: int, dim: int, exponent: float, generator: Generator) -> Samples:
-    """Return normal numbers of variance 1 with a power spectrum 1 / frequency^exponent along decisions; 0: white.
+    """Return normal numbers of variance 1 with a power spectrum 1 / frequency^exponent along the decisions.
 
-    The constant component has the power of the lowest frequency.
+    An exponent of 0 gives white noise. The constant component has the power of the lowest frequency.
 
     Source: Timmer and König, On generating power law noise, Astronomy and Astrophysics 300 (1995): normal Fourier
     coefficients, scaled.
     """
     frequency = torch.fft.rfftfreq(decisions).clamp(min=1 / decisions)
     scale = frequency ** (-exponent / 2)
-    parts = torch.randn(2, samples, dim, len(frequency), generator=generator)
-    is_real = torch.zeros(len(frequency), dtype=torch.bool)  # constant and Nyquist, which have no conjugate
+    coefficients = torch.randn(2, samples, dim, len(frequency), generator=generator)
+    is_real = torch.zeros(len(frequency), dtype=torch.bool)  # true for the constant and the Nyquist frequency
     is_real[0] = True
     is_real[-1] = is_real[-1] or decisions % 2 == 0
-    wave = torch.complex(parts[0], parts[1].masked_fill(is_real, 0.0)) * torch.where(is_real, 1.0, 0.5**0.5)
+    wave = torch.complex(coefficients[0], coefficients[1].masked_fill(is_real, 0.0)) * torch.where(
+        is_real, 1.0, 0.5**0.5
+    )
     power: Tensor = (scale**2 * torch.where(is_real, 1.0, 2.0)).sum() / decisions
     noise: Tensor = torch.fft.irfft(wave * scale, n=decisions, norm="ortho").transpose(1, 2)
     return noise / power.sqrt()
 
 
 class MppiSolver(Solver):
-    """MPPI: the mean is weighted by exp(-energy / temperature), and the noise decays by a fixed factor.
+    """MPPI: the new mean weights the samples by exp(-energy / temperature), and the noise decays by a fixed factor.
 
-    The mean itself is also evaluated. The control cost of the paper is omitted: the limits define the allowed actions.
+    The mean itself is also evaluated. The paper's control cost is omitted, because the limits bound the actions.
 
     Source: Williams et al., Information Theoretic MPC for Model-Based Reinforcement Learning, ICRA 2017, algorithm 2.
     """
@@ -316,14 +319,14 @@ class MppiSolver(Solver):
 
 
 class PriorSolver(Solver):
-    """No search: the action prior's proposal, evaluated once.
+    """The action prior's proposal, evaluated once, without a search.
 
     Raises:
         InputError: There is no start, because no prior is loaded.
     """
 
     def num_samples(self, iteration: int) -> int:
-        """Return 1 for the first iteration and 0, which ends the search, for the second."""
+        """Return 1 for the first iteration, and 0 for the second, which ends the search."""
         return int(iteration == 0)
 
     def begin(self, start: OptionalStart) -> None:
@@ -344,10 +347,10 @@ class PriorSolver(Solver):
 
 
 class GradientSolver(Solver):
-    """Gradient descent: Adam on decisions in units of their limits, projected onto the allowed set after every step.
+    """Gradient descent: Adam on decisions in units of their limits, clipped to the limits after every step.
 
-    Several starts descend independently. The first begins at the best elite of the previous decision, not at the mean
-    of the elites, because these may be different solutions. The result is the best of all evaluated decisions.
+    Several descents run independently. The first begins at the best elite of the previous plan, not at the mean of its
+    elites, because these may be different solutions. The result is the best of all evaluated decisions.
     """
 
     uses_gradients = True
@@ -359,7 +362,7 @@ class GradientSolver(Solver):
         """Sequences that are optimised in parallel: the first starts from the previous plan (or zero motion), the
         others from random sequences."""
         learning_rate: Positive = 0.1
-        """Learning rate of Adam at the first iteration, as a share of the limits; it decays linearly to zero."""
+        """Learning rate of Adam at the first iteration, as a fraction of the limits; it decays linearly to zero."""
 
     @property
     def elites(self) -> int:

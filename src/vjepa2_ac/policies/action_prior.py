@@ -261,7 +261,7 @@ def train_prior(
     data, frames = config.data, open_dataset(config.data, progress=reporter.task(INDEXING))
     reporter.task(LOADING)
     model, spaces = load_base(config.model, seed=config.seed).to(device), frames.spaces  # only the encoder is used
-    if spaces.action.follows == "unknown":
+    if spaces.action.effect == "unknown":
         problem = "actions whose effect on the state is unknown, so that a planner cannot use them"
         needed = "data.actions: difference, or data.join_actions: sum or last"
         raise InputError(where="data.actions: recorded", found=problem, needed=needed)
@@ -343,7 +343,7 @@ def _draw_pairs(clips: LatentBatch, spaces: Spaces, generator: torch.Generator) 
     rows, positions = torch.arange(count), torch.randint(steps, (count,), generator=generator)
     gap = 1 + (torch.rand(count, generator=generator) * (steps - positions)).long()
     states, changes = clips.states[rows, positions], clips.actions[rows, positions]
-    if spaces.action.follows == "target":
+    if spaces.action.effect == "target":
         changes = changes - states
     goal = clips.latents[rows, positions + gap]
     return _Pairs(clips.latents[rows, positions], goal, gap.to(goal.device), states, changes)

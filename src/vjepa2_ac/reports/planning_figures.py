@@ -103,7 +103,7 @@ def _draw_search(part: Any, result: PlanResult, plan: Plan) -> None:
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
     factor = result.state_space.display_factor
     first, upper = result.actions[0] * factor, result.space.upper[0].double().numpy() * factor
-    shown = result.controller.display_axes  # with fewer than three components, one of them is shown twice
+    shown = result.controller.display_components  # with fewer than three components, one of them is shown twice
     across, up, third = shown[0], shown[min(1, len(shown) - 1)], shown[-1]
     for number, (iteration, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
         first_actions = iteration.elites[:, 0].double().numpy() * factor
@@ -185,7 +185,7 @@ def _draw_slices(part: Any, result: PlanResult) -> None:
         colours = {"shading": "nearest", "cmap": "viridis", "vmin": lowest, "vmax": highest}
         image = axes.pcolormesh(energy_slice.across * factor, energy_slice.up * factor, energy_slice.energy, **colours)
         axes.plot(0, 0, "+", color="white", markersize=9)
-        _draw_plane(axes, result, *energy_slice.axes)
+        _draw_plane(axes, result, *energy_slice.components)
         axes.set_title("\n")
     all_axes[0].set_title("Energy around the first action\n(star: plan; +: zero action; box: limits)")
     part.colorbar(image, ax=list(all_axes), label="energy", shrink=0.85)

@@ -56,7 +56,7 @@ def get_action_space(session: Session) -> str:
     space = session.controller.spaces
     if session.options.actions == "pose":
         return "cartesian_position"
-    return "cartesian_delta" if space.state.is_pose else f"vector_{space.action.follows}"
+    return "cartesian_delta" if space.state.is_pose else f"vector_{space.action.effect}"
 
 
 def describe_server(metadata: Mapping[str, Any], subject: str) -> str:

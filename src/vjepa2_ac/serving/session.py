@@ -273,7 +273,7 @@ class Session:
         """
         if self.options.actions == "pose":
             return interpolate_waypoints(state, changes[0], self.options.control_steps)
-        if self.controller.spaces.action.follows == "target":
+        if self.controller.spaces.action.effect == "target":
             return np.asarray(state + np.cumsum(changes, axis=0))
         return changes
 

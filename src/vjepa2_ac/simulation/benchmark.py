@@ -90,7 +90,7 @@ class Planning:
             raise ValueError(f"{self.name} needs joint angles, which this environment does not measure")
         action = self.controller.act(observation.image, state)
         self.why = self.controller.decision.why if self.controller.decision else ""
-        return action - state if spaces.action.follows == "target" else action
+        return action - state if spaces.action.effect == "target" else action
 
 
 def require_measured_inputs(subject: Subject, *, world: bool) -> None:
