@@ -17,7 +17,7 @@ from paths import GOLDEN
 from synthetic import synthetic_states
 from vjepa2_ac.config import IdleConfig
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.idle import idle_by_commands, idle_by_motion, moving_ranges
+from vjepa2_ac.data.idle import find_idle_by_commands, find_idle_by_motion, find_moving_ranges
 from vjepa2_ac.errors import InputError
 
 COMMANDS = IdleConfig(rule="commands")
@@ -35,24 +35,24 @@ def resting(steps: int, rests: list[tuple[int, int]], *, seed: int = 0) -> np.nd
 def test_commands_rule_keeps_the_same_ranges_as_openpi() -> None:
     golden = np.load(GOLDEN / "idle_ranges.npz")
     for number in range(3):
-        idle = idle_by_commands(golden[f"velocities_{number}"].astype(np.float64), COMMANDS)
-        assert moving_ranges(idle, COMMANDS) == [tuple(pair) for pair in golden[f"ranges_{number}"].tolist()]
+        idle = find_idle_by_commands(golden[f"velocities_{number}"].astype(np.float64), COMMANDS)
+        assert find_moving_ranges(idle, COMMANDS) == [tuple(pair) for pair in golden[f"ranges_{number}"].tolist()]
 
 
 @pytest.mark.parametrize("number", range(7))
 def test_translation_rotation_or_gripper_motion_is_not_idle(number: int) -> None:
     states = np.tile(np.array([0.5, 0.0, 0.3, np.pi, 0.0, 1.0, 0.5]), (30, 1))
     states[:, number] += np.linspace(0, 0.5, 30)
-    assert not idle_by_motion(states, MOTION)[1:].any()
-    assert idle_by_motion(states[:1].repeat(30, axis=0), MOTION)[1:].all()
+    assert not find_idle_by_motion(states, MOTION)[1:].any()
+    assert find_idle_by_motion(states[:1].repeat(30, axis=0), MOTION)[1:].all()
 
 
 def test_idle_steps_are_detected_where_roll_wraps() -> None:
     states = resting(60, [(20, 40)])
     states[20:40, 3] += np.where(np.arange(20) % 2, 2 * np.pi, 0)  # the same angle, plus 2 pi
-    idle = idle_by_motion(states, MOTION)
+    idle = find_idle_by_motion(states, MOTION)
     assert np.flatnonzero(idle).tolist() == list(range(20, 40))
-    assert moving_ranges(idle, MOTION) == [(0, 10), (40, 50)]
+    assert find_moving_ranges(idle, MOTION) == [(0, 10), (40, 50)]
 
 
 def test_short_idle_runs_are_not_removed_and_short_moves_are() -> None:
@@ -60,7 +60,7 @@ def test_short_idle_runs_are_not_removed_and_short_moves_are() -> None:
         idle = np.zeros(80, bool)
         for start, end in rests:
             idle[start:end] = True
-        return moving_ranges(idle, IdleConfig(rule="motion", **options))
+        return find_moving_ranges(idle, IdleConfig(rule="motion", **options))
 
     assert ranges([(30, 36)]) == [(0, 70)]
     assert ranges([(30, 37)]) == [(0, 20), (37, 70)]
@@ -74,7 +74,7 @@ def test_short_idle_runs_are_not_removed_and_short_moves_are() -> None:
 @settings(max_examples=60)
 @given(idle=st.lists(st.booleans(), max_size=120))
 def test_selected_ranges_are_disjoint_and_contain_no_long_idle_run(idle: list[bool]) -> None:
-    ranges = moving_ranges(np.array(idle, bool), MOTION)
+    ranges = find_moving_ranges(np.array(idle, bool), MOTION)
     edges = [edge for pair in ranges for edge in pair]
     assert edges == sorted(set(edges))
     assert all(0 <= edge <= len(idle) for edge in edges)

@@ -103,17 +103,17 @@ class Slow(Iterator[int]):
 
 
 def test_slow_batch_is_awaited_unless_a_stop_signal_arrived(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert loader._next_row(Slow(), ()) == 7
+    assert loader._next_result(Slow(), ()) == 7
     with pytest.raises(RuntimeError, match="another"):
-        loader._next_row(Slow("another"), ())
+        loader._next_result(Slow("another"), ())
     stop = StopRequest()
     stop.record(signal.SIGTERM, None)
     stop._received_at -= 100.0
     monkeypatch.setattr(loader, "stop_request", lambda: stop)
-    assert loader._next_row(Slow(), ()) == 7, "only a wait after the signal counts"
+    assert loader._next_result(Slow(), ()) == 7, "only a wait after the signal counts"
     monkeypatch.setattr(loader, "_GRACE_S", 0.0)
     with pytest.raises(UnreachableError, match="no batch arrived after SIGTERM"):
-        loader._next_row(Slow(), ())
+        loader._next_result(Slow(), ())
 
 
 # Files in the working directory that are named like modules.

@@ -62,7 +62,7 @@ def test_mask_can_exclude_one_view() -> None:
 
 def test_image_width_that_does_not_fit_the_views_raises() -> None:
     odd = np.zeros((64, 65, 3), dtype=np.uint8)
-    with pytest.raises(InputError, match=r"65 pixels wide.* 2 views share"):
+    with pytest.raises(InputError, match=r"65 pixels wide.* a multiple of 2"):
         decide(odd, odd, 2)
 
 

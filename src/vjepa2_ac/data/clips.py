@@ -34,7 +34,7 @@ class ClipRequest:
 
 @dataclass(frozen=True)
 class ClipDataset(TorchDataset[Clip]):
-    """The clips of a split by index, for any `torch.utils.data.DataLoader`; see `dataset.Dataset.clips`."""
+    """A data set of the clips of a split, for any `torch.utils.data.DataLoader`; see `dataset.Dataset.clips`."""
 
     read: Callable[[int], Clip]
     count: int
@@ -101,7 +101,7 @@ def compute_actions(
         states: States at the steps of the clip, in the config's coordinate frame.
         commands: Recorded commands of all control steps of the episode; used only with `data.actions: recorded`.
         steps: Control steps of the clip, equally spaced.
-        config: The definition of an action.
+        config: Defines an action with `data.actions` and `data.join_actions`.
 
     Raises:
         ValueError: Commands are required and the episode has none.
@@ -114,17 +114,17 @@ def compute_actions(
 
 
 def join_commands(
-    commands: Float[np.ndarray, "steps action_dim"], stride: int, how: str | None
+    commands: Float[np.ndarray, "steps action_dim"], stride: int, operation: str | None
 ) -> Float[np.ndarray, "model_steps action_dim"]:
-    """Join the commands of each model step to one action: their sum, mean, or the last command.
+    """Join the commands of each model step into one action: their sum, their mean, or the last command.
 
     The command of a control step is sent after the state of that step was measured, so the model step from control
-    step t to t + stride has the commands of t .. t + stride - 1.
+    step t to t + stride joins the commands of the control steps t to t + stride - 1.
     """
     groups = commands.reshape(-1, stride, commands.shape[1])
-    if how == "sum":
+    if operation == "sum":
         return np.asarray(groups.sum(axis=1))
-    if how == "mean":
+    if operation == "mean":
         return np.asarray(groups.mean(axis=1))
     return groups[:, -1]  # also for stride 1, where a group has one command
 
@@ -139,11 +139,14 @@ def collate(clips: Sequence[Clip]) -> Batch:
     sizes = [
         ("x".join(map(str, array.shape[1:3])), clip.episode_id) for array, clip in zip(frames, clips, strict=False)
     ]
-    if other := next((pair for pair in sizes if pair[0] != sizes[0][0]), None):
-        (size, first), (other_size, name) = sizes[0], other
-        problem = f"frames of {other_size} pixels after the crop, but those of episode {first} have {size}"
-        fix = "Train on episodes of one size, or set training.batch_size: 1"
-        raise add_exclusion_fix(InputError(where=f"episode {name}", found=problem, fix=fix), [name])
+    first_size, first_episode = sizes[0] if sizes else ("", "")
+    for size, episode in sizes:
+        if size != first_size:
+            problem = (
+                f"frames of {size} pixels after the crop, but the frames of episode {first_episode} have {first_size}"
+            )
+            fix = "Train on episodes with frames of one size, or set training.batch_size: 1"
+            raise add_exclusion_fix(InputError(where=f"episode {episode}", found=problem, fix=fix), [episode])
     latents = [clip.latents for clip in clips if clip.latents is not None]
     extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
     return Batch(
@@ -167,8 +170,8 @@ default_collate_fn_map[Clip] = _collate_by_default  # PyTorch documents this as 
 
 def join_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:
     """Join latents and their scales with `torch.stack` or `torch.cat`."""
-    scales = [part.scales for part in latents if part.scales is not None]
-    return StoredLatents(join([part.values for part in latents]), join(scales) if scales else None)
+    scales = [stored.scales for stored in latents if stored.scales is not None]
+    return StoredLatents(join([stored.values for stored in latents]), join(scales) if scales else None)
 
 
 def empty_batch(frames: int, widths: Widths) -> Batch:

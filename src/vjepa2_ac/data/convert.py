@@ -1,8 +1,8 @@
 """Convert any supported data set to a LeRobot data set v3.0.
 
-Frames become H.264 (yuv420p, constant rate factor 18, a key frame every 2 frames), which is lossy; numbers and texts
-are exact. Each episode and camera has an MP4, and one table has a row group per episode. Layout, names and types are
-those of LeRobot 0.4.4.
+Frames are encoded as H.264 (yuv420p, constant rate factor 18, a key frame every 2 frames), which is lossy. Numbers and
+texts are stored exactly. There is one MP4 for each episode and camera, and one table of numbers with a row group for
+each episode. Layout, names and types are those of LeRobot 0.4.4.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from vjepa2_ac.reporter import INDEXING, Reporter
 
 STATE, ACTION, SUCCESS, CAMERA = "observation.state", "action", "is_episode_successful", "observation.images."
 
-_FRAMES_AT_ONCE = 32  # frames in memory
+_FRAMES_AT_ONCE = 32  # frames that are decoded together, which limits the memory
 Columns = Mapping[str, Shaped[np.ndarray, "steps numbers"]]
 Frames = Iterable[UInt8[np.ndarray, "height width 3"]]
 Statistics = dict[str, np.ndarray]
-"""min, max, mean, std, count and quantiles of a feature, by LeRobot's names."""
+"""min, max, mean, std, count and quantiles of a feature, under the names that LeRobot uses."""
 
 _TEMPLATE = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "lerobot" / "v30.json"
-_TASK = "__index_level_0__"  # the task texts are the index of a pandas table, by which LeRobot looks tasks up
+_TASK = "__index_level_0__"  # column of the task texts: the index of the pandas table in which LeRobot looks tasks up
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-_CRF, _KEY_FRAME_EVERY = 18, 2
+_CRF, _KEY_FRAME_EVERY = 18, 2  # constant rate factor of H.264, and frames per key frame
 _SAMPLED_FRAMES, _SAMPLED_SIDE = 32, 100  # frames per episode, and pixels per side, for the statistics of a camera
 _EPISODES_AT_ONCE = 100  # rows per write of the table of episodes
 
@@ -48,9 +48,9 @@ def convert_to_lerobot(config: DataConfig, folder: Path, reporter: Reporter) -> 
     """Write a data set as LeRobot v3.0 and return the numbers of written episodes and control steps.
 
     The episodes that `data.exclude` and `data.outcome` select are written completely, including idle steps, in the
-    order of the source. An episode has measured states, actions, the frames of all cameras of `data.camera`, task and
-    success. Its actions are the recorded commands if `data.actions` is recorded, otherwise the change to the next
-    control step (0 at the last step). The folder appears only when it is complete.
+    order of the source. Each written episode has measured states, actions, the frames of all cameras of `data.camera`,
+    the task and the success label. The actions are the recorded commands if `data.actions` is recorded, otherwise the
+    change to the next control step (0 at the last step). The folder appears only when it is complete.
 
     Args:
         config: The data set and how to read it.
@@ -69,23 +69,24 @@ def convert_to_lerobot(config: DataConfig, folder: Path, reporter: Reporter) -> 
         )
     dataset = open_dataset(config.model_copy(update={"idle": IdleConfig()}), progress=reporter.task(INDEXING))
     episodes = np.flatnonzero(dataset.is_selected).tolist()
-    is_known = dataset.table.success[episodes] >= 0
-    if is_known.any() and not is_known.all():
+    has_label = dataset.table.success[episodes] >= 0
+    if has_label.any() and not has_label.all():
+        num_unlabelled = (~has_label).sum()
         reporter.note(
-            f"Success is not written: {(~is_known).sum()} of {counted(len(episodes), 'episode')} have no success label."
+            f"Success is not written: {num_unlabelled} of {counted(len(episodes), 'episode')} have no success label."
         )
     progress, spaces = reporter.task("writing episodes"), dataset.spaces
     names = {STATE: spaces.state.names, ACTION: spaces.action.names}
     with (
-        storage.folder_writer(folder, INFO) as filling,
-        closing(LeRobotWriter(filling, dataset.control_rate_hz, names)) as writer,
+        storage.folder_writer(folder, INFO) as unfinished_folder,
+        closing(LeRobotWriter(unfinished_folder, dataset.control_rate_hz, names)) as writer,
     ):
-        for done, index in enumerate(episodes, start=1):
+        for num_done, index in enumerate(episodes, start=1):
             try:
-                _write_episode(writer, dataset, index, has_success=bool(is_known.all()))
+                _write_episode(writer, dataset, index, has_success=bool(has_label.all()))
             except InputError as error:
                 dataset.skip_episode(index, error)
-            progress(done, len(episodes))
+            progress(num_done, len(episodes))
         writer.finish()
     return writer.num_episodes, writer.num_steps
 
@@ -93,14 +94,14 @@ def convert_to_lerobot(config: DataConfig, folder: Path, reporter: Reporter) -> 
 def _write_episode(writer: LeRobotWriter, dataset: Dataset, index: int, *, has_success: bool) -> None:
     by_camera = {camera: dataset.read(index, camera) for camera in dataset.config.cameras}
     recording = next(iter(by_camera.values()))
-    columns = {STATE: recording.states.astype(np.float32), ACTION: _actions(recording, dataset)}
+    columns = {STATE: recording.states.astype(np.float32), ACTION: _compute_actions(recording, dataset)}
     if has_success:
         columns[SUCCESS] = np.full((len(recording.states), 1), dataset.table[index].success)
-    frames = {CAMERA + camera: _frames(episode) for camera, episode in by_camera.items()}
+    frames = {CAMERA + camera: _read_all_frames(episode) for camera, episode in by_camera.items()}
     writer.add(columns, frames, recording.metadata.get("language", ""))
 
 
-def _actions(recording: Episode, dataset: Dataset) -> Float32[np.ndarray, "steps action_dim"]:
+def _compute_actions(recording: Episode, dataset: Dataset) -> Float32[np.ndarray, "steps action_dim"]:
     if recording.commands is not None:
         return recording.commands.astype(np.float32)
     actions = np.zeros(recording.states.shape, np.float32)
@@ -109,19 +110,19 @@ def _actions(recording: Episode, dataset: Dataset) -> Float32[np.ndarray, "steps
     return actions
 
 
-def _frames(recording: Episode) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def _read_all_frames(recording: Episode) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     steps = range(len(recording.states))
     for first in steps[::_FRAMES_AT_ONCE]:
         yield from recording.read_frames(steps[first : first + _FRAMES_AT_ONCE])
 
 
 class LeRobotWriter:
-    """A writer of episodes into an empty folder; after `finish` the data set is complete.
+    """A writer of episodes into an empty folder. The data set is complete after `finish`.
 
     Args:
         folder: The folder.
         rate_hz: Control steps per second.
-        names: The names of a column's numbers, by feature.
+        names: The names of the numbers of a feature, by the feature's name.
     """
 
     def __init__(self, folder: Path, rate_hz: float, names: Mapping[str, Sequence[str]]) -> None:
@@ -139,12 +140,12 @@ class LeRobotWriter:
         """Write an episode, or nothing if one of its frames cannot be used.
 
         Args:
-            columns: The numbers of the episode, by feature.
-            frames: One frame per step, by feature; an odd last row or column of pixels is dropped.
+            columns: The numbers of the episode, by the name of the feature.
+            frames: One frame per step, by the name of the feature. An odd last row or column of pixels is dropped.
             task: The instruction; may be empty.
 
         Raises:
-            InputError: A frame has another size than those of the first episode, or `frames` raised it.
+            InputError: A frame cannot be read, or its size differs from the frames of the first episode.
             OSError: A file cannot be written.
         """
         number, start, steps = self.num_episodes, self.num_steps, len(next(iter(columns.values())))
@@ -176,12 +177,14 @@ class LeRobotWriter:
             for path in videos.values():
                 path.unlink(missing_ok=True)
             raise
-        rows = {name: self._column(values) for name, values in columns.items()}
+        rows = {name: self._to_arrow(values) for name, values in columns.items()}
         self._append(fill_template(self._template["info"]["data_path"], 0, 0), rows)
-        for name, added in statistics.items():
-            row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in added.items()}
-            earlier = self._statistics.get(name)
-            self._statistics[name] = added if earlier is None else combine_statistics(earlier, added)
+        for name, episode_statistics in statistics.items():
+            row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in episode_statistics.items()}
+            total = self._statistics.get(name)
+            self._statistics[name] = (
+                episode_statistics if total is None else combine_statistics(total, episode_statistics)
+            )
         self._rows.append(row | _file_indices("meta/episodes", 0, 0))
         self._tasks.setdefault(task, len(self._tasks))
         self.num_episodes, self.num_steps = number + 1, start + steps
@@ -206,24 +209,24 @@ class LeRobotWriter:
             table.close()
 
     def _write_video(self, path: Path, key: str, frames: Frames, steps: int) -> Statistics:
-        """Write the video of a camera; return statistics of a sample of its pixels, scaled to 0 .. 1."""
+        """Write the video of a camera, and return statistics of a sample of its pixels as values from 0 to 1."""
         sample: list[UInt8[np.ndarray, "height width 3"]] = []
 
-        def frames_with_sampling() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+        def sample_while_iterating() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
             for step, frame in enumerate(frames):
                 height, width = (size // 2 * 2 for size in frame.shape[:2])
                 first_shape = self._features.setdefault(key, self._describe_camera(height, width))["shape"]
                 if first_shape[:2] != [height, width]:
                     needed = f"{first_shape[0]}x{first_shape[1]}, as in the first episode"
-                    fix = "Convert recordings of different cameras to different data sets"
+                    fix = "Convert recordings with different image sizes to separate data sets"
                     raise InputError(where=key, found=f"frames of {height}x{width}", needed=needed, fix=fix)
                 if step % (steps // _SAMPLED_FRAMES + 1) == 0:
-                    every = min(height, width) // _SAMPLED_SIDE + 1
-                    sample.append(frame[:height:every, :width:every])
+                    pixel_stride = min(height, width) // _SAMPLED_SIDE + 1
+                    sample.append(frame[:height:pixel_stride, :width:pixel_stride])
                 yield frame
 
         write_video(
-            path, frames_with_sampling(), rate_hz=float(self._rate_hz), crf=_CRF, key_frame_every=_KEY_FRAME_EVERY
+            path, sample_while_iterating(), rate_hz=float(self._rate_hz), crf=_CRF, key_frame_every=_KEY_FRAME_EVERY
         )
         pixel_statistics = compute_statistics(np.stack(sample).reshape(-1, 3) / 255) | {
             "count": np.array([len(sample)])
@@ -235,7 +238,7 @@ class LeRobotWriter:
         shape, names = [height, width, 3], ["height", "width", "channels"]
         return {"dtype": "video", "shape": shape, "names": names, "info": self._template["camera"] | sizes}
 
-    def _column(self, values: Shaped[np.ndarray, "steps numbers"]) -> Any:
+    def _to_arrow(self, values: Shaped[np.ndarray, "steps numbers"]) -> Any:
         flat, width = self._pa.array(values.ravel()), values.shape[1]
         return flat if width == 1 else self._pa.FixedSizeListArray.from_arrays(flat, width)
 
@@ -244,9 +247,9 @@ class LeRobotWriter:
             self._append(fill_template(TABLES["v3.0"], 0, 0), {name: [row[name] for row in rows] for name in rows[0]})
             rows.clear()
 
-    def _append(self, name: str, columns: Mapping[str, Any], about: Mapping[str, str] | None = None) -> None:
+    def _append(self, name: str, columns: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
         """Append a row group to a Parquet file, creating the file if needed."""
-        table = self._pa.table(dict(columns), metadata=about)
+        table = self._pa.table(dict(columns), metadata=metadata)
         if name not in self._tables:
             path = self._folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -263,11 +266,13 @@ def compute_statistics(values: Shaped[np.ndarray, "steps numbers"]) -> Statistic
 
 
 def combine_statistics(first: Statistics, second: Statistics) -> Statistics:
-    """Combine the statistics of two sets of steps; quantiles are averaged with weights, as in LeRobot."""
-    share = second["count"] / (first["count"] + second["count"])
-    averages = {name: first[name] + (second[name] - first[name]) * share for name in ("mean", *_QUANTILES)}
-    variances = [part["std"] ** 2 + (part["mean"] - averages["mean"]) ** 2 for part in (first, second)]
-    std, count = np.sqrt(variances[0] * (1 - share) + variances[1] * share), first["count"] + second["count"]
+    """Combine the statistics of two sets of steps. Quantiles are averaged, weighted by count, as in LeRobot."""
+    weight = second["count"] / (first["count"] + second["count"])
+    averages = {name: first[name] + (second[name] - first[name]) * weight for name in ("mean", *_QUANTILES)}
+    variances = [
+        statistics["std"] ** 2 + (statistics["mean"] - averages["mean"]) ** 2 for statistics in (first, second)
+    ]
+    std, count = np.sqrt(variances[0] * (1 - weight) + variances[1] * weight), first["count"] + second["count"]
     extremes = {"min": np.minimum(first["min"], second["min"]), "max": np.maximum(first["max"], second["max"])}
     return {**extremes, "std": std, "count": count, **averages}
 

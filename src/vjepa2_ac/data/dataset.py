@@ -47,7 +47,7 @@ class Removed:
 
     name: str  # name of the filter: excluded, broken, outcome or idle
     episodes: int  # number of episodes without remaining steps
-    steps: int  # number of steps in episodes that could be read
+    steps: int  # number of steps, without those of episodes that cannot be read
     windows: int | None  # number of clips; None while data.stride is auto
 
     def __str__(self) -> str:
@@ -87,8 +87,8 @@ class Dataset:
         """Return the clips of a split as a `torch.utils.data.Dataset`.
 
         The order is fixed: clips are sorted by the identity of their episode and then by their first control step,
-        independent of the seed. With several cameras a hash of the clip selects one. Clips are as recorded, because
-        `data.transforms` depends on the position in a training run.
+        independent of the seed. With several cameras a hash of the clip selects the camera. `data.transforms` are not
+        applied, because they depend on the position of a clip in a training run.
 
         Returns:
             `len(clips)` clips; `clips[i]` is an `episode.Clip` of `frames` (time x height x width x 3, uint8, RGB,
@@ -97,8 +97,8 @@ class Dataset:
             shuffle and use any number of workers; for data behind a URL the workers must not be forked.
 
         Raises:
-            InputError: No such split, no clips, or `data.stride` is auto. `clips[i]` raises it if the clip cannot be
-                read, independent of `data.broken_episodes`; DataLoader turns it into a RuntimeError in workers.
+            InputError: There is no such split, it has no clips, or `data.stride` is auto. `clips[i]` raises the error
+                if the clip cannot be read, independent of `data.broken_episodes`. In workers it is a RuntimeError.
 
         Example:
             >>> loader = torch.utils.data.DataLoader(dataset.clips("train"), batch_size=8, shuffle=True, num_workers=4)
@@ -114,14 +114,14 @@ class Dataset:
         from vjepa2_ac.data.clips import ClipRequest
 
         episode, start = window
-        number = draw_uniform(int(~self.table.id_hash[episode]), start)
-        return ClipRequest(episode, start, self.config.cameras[int(number * len(self.config.cameras))])
+        fraction = draw_uniform(int(~self.table.id_hash[episode]), start)
+        return ClipRequest(episode, start, self.config.cameras[int(fraction * len(self.config.cameras))])
 
     def windows(self, split: Split) -> Windows:
         """Return the windows of a split, one per clip, in the fixed order of `clips`.
 
         Raises:
-            InputError: No such split, or no clips; see `select_split_windows`. Or `data.stride` is auto.
+            InputError: There is no such split, it has no clips, or `data.stride` is auto.
         """
         if split not in get_args(Split):
             raise InputError(where="split", found=repr(split), needed=", ".join(get_args(Split)))
@@ -133,17 +133,17 @@ class Dataset:
 
     def _empty_split_error(self, split: Split) -> InputError:
         config, is_selected = self.config, self.is_selected
-        groups = None if config.split_by is None else len(np.unique(self.split_hash[is_selected]))
-        together = "" if groups is None else f" in {groups} groups (data.split_by)"
+        num_groups = len(np.unique(self.split_hash[is_selected]))
+        grouping = "" if config.split_by is None else f" in {num_groups} groups (data.split_by)"
         shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
         fix = "Lower data.validation_share or data.test_share" if split == "train" else f"Raise data.{split}_share"
         if split in held_out_splits(self.table, config):
             fix = "Set data.splits: hash to draw the splits from all episodes"
-        problem = f"no {split} episodes among {is_selected.sum()}{together} ({shares})"
+        problem = f"no {split} episodes among {is_selected.sum()}{grouping} ({shares})"
         return InputError(where=f"data.path: {config.path}", found=problem, fix=fix)
 
     def with_frames(self, frames: int) -> Dataset:
-        """Return the data set with clips of another length; clips of a latent cache must need the same frames."""
+        """Return the data set with clips of another length. A latent cache must have the frames of these clips."""
         return replace(self, config=self.config.model_copy(update={"frames": frames}))
 
     def with_stride(self, stride: int) -> Dataset:
@@ -164,20 +164,20 @@ class Dataset:
         not_excluded = select_included(self.table, self.config)
         selected = not_excluded & select_outcome(self.table, self.config)
         masks = np.ones(len(self.table), bool), not_excluded, selected, self.is_selected
-        left = [self._count(StepSelection.all_steps(self.table, mask)) for mask in masks]
-        removed = -np.diff([*left, self._count(self.selected_steps)], axis=0)
+        remaining = [self._count(StepSelection.all_steps(self.table, mask)) for mask in masks]
+        removed = -np.diff([*remaining, self._count(self.selected_steps)], axis=0)
         excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
-        unread = {"excluded": excluded, "outcome": 0, "broken": len(self.table.problems) - excluded, "idle": 0}
-        is_known = self.config.stride != "auto"
+        unusable = {"excluded": excluded, "outcome": 0, "broken": len(self.table.problems) - excluded, "idle": 0}
+        has_stride = self.config.stride != "auto"
         return tuple(
-            Removed(name, episodes + unread[name], steps, windows if is_known else None)
-            for name, (episodes, steps, windows) in zip(unread, removed.tolist(), strict=True)
+            Removed(name, episodes + unusable[name], steps, windows if has_stride else None)
+            for name, (episodes, steps, windows) in zip(unusable, removed.tolist(), strict=True)
         )
 
     def _count(self, steps: StepSelection) -> tuple[int, int, int]:
-        """Return the numbers of episodes, steps and windows (0 if the stride is unknown)."""
-        is_known = self.config.stride != "auto"
-        windows = len(find_clip_windows(self.table, steps, self.config)) if is_known else 0
+        """Return the numbers of episodes, steps and windows (0 while `data.stride` is auto)."""
+        has_stride = self.config.stride != "auto"
+        windows = len(find_clip_windows(self.table, steps, self.config)) if has_stride else 0
         return len(np.unique(steps.episode)), steps.num_steps, windows
 
     @property
@@ -187,10 +187,10 @@ class Dataset:
 
     @cached_property
     def starts(self) -> Windows:
-        """The clips of all splits.
+        """The windows of the clips of all splits.
 
         Raises:
-            ValueError: The stride is not yet calibrated.
+            ValueError: `data.stride` is auto.
         """
         return find_clip_windows(self.table, self.selected_steps, self.config)
 
@@ -207,7 +207,7 @@ class Dataset:
 
     @cached_property
     def widths(self) -> Widths:
-        """The widths of states and actions: 7 for poses, otherwise those of the first readable episode.
+        """How many numbers a state and an action have: 7 for poses, otherwise as in the first readable episode.
 
         Raises:
             InputError: The first episodes cannot be read.
@@ -225,7 +225,7 @@ class Dataset:
         """Apply `data.broken_episodes` to an episode that cannot be read: record the episode, or raise the error.
 
         Raises:
-            InputError: The policy is error, or too many episodes are broken.
+            InputError: `data.broken_episodes` is error, or too many episodes are broken.
         """
         name = self.table.identity(episode)
         if self.config.broken_episodes == "error":
@@ -233,7 +233,7 @@ class Dataset:
         self.broken.record(name, str(error))
 
     def read(self, episode: int, camera: str | None = None) -> Episode:
-        """Return an episode; frames are read only on `Episode.read_frames`.
+        """Return an episode; frames are only read by `Episode.read_frames`.
 
         Raises:
             InputError: The episode cannot be read, or its states or actions have other widths than the data set.
@@ -274,17 +274,17 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     dataset = Dataset(config, source, table, steps, broken)
     dataset = replace(dataset, groups=hash_groups(table, dataset.is_selected, config))
     if not len(dataset.episodes):
-        filters = ", ".join(f"{removed.name} {removed.episodes}" for removed in dataset.removed if removed.episodes)
-        left_out = f" (removed: {filters})" if filters else ""
-        text = f"none of {counted(len(table) + len(table.problems), 'episode')} remains{left_out}"
+        filters = ", ".join(f"{removal.name} {removal.episodes}" for removal in dataset.removed if removal.episodes)
+        removed = f" (removed: {filters})" if filters else ""
+        problem = f"none of {counted(len(table) + len(table.problems), 'episode')} remains{removed}"
         fix = "Check data.exclude, data.outcome and data.idle" if filters else ""
-        raise InputError(where=f"data.path: {config.path}", found=text, fix=fix)
+        raise InputError(where=f"data.path: {config.path}", found=problem, fix=fix)
     logger.info("%s: using %d episodes with %d steps", config.path, dataset.is_selected.sum(), steps.num_steps)
     return _resolve_cameras(dataset)
 
 
 def open_cached_latents(dataset: Dataset, folder: Path | str) -> Dataset:
-    """Return the same data set, with the same clips in the same order, read from its latent cache.
+    """Return the data set with the same clips in the same order, but read from its latent cache.
 
     Raises:
         InputError: The cache lacks episodes or is damaged.
@@ -308,7 +308,7 @@ def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
     """Return a clip, decoding only the frames of the clip.
 
     Raises:
-        InputError: The episode or one of the frames cannot be read. The error has no fix that excludes the episode.
+        InputError: The episode or one of the frames cannot be read. The fix of the error does not exclude the episode.
     """
     from vjepa2_ac.data.clips import cut_clip
 
@@ -324,7 +324,7 @@ def _read_window(dataset: Dataset, windows: Windows, index: int) -> Clip:
 
 
 def frames_for_display(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return the cropped frames of a clip in a batch, for display; for cached latents the small frames of the cache.
+    """Return the cropped frames of a clip in a batch, for display; a latent cache has only small frames.
 
     Raises:
         InputError: The frames of a cache cannot be read.
@@ -362,7 +362,7 @@ def find_episode(dataset: Dataset, name: str) -> int:
 
 
 def get_widths(episode: Episode) -> Widths:
-    """Return the widths of an episode's states and actions."""
+    """Return how many numbers the states and the actions of an episode have."""
     state = int(episode.states.shape[1])
     return Widths(state, state if episode.commands is None else int(episode.commands.shape[1]))
 
@@ -377,5 +377,5 @@ def require_widths(episode: Episode, widths: Widths) -> None:
     if actual != widths:
         problem = f"states of {actual.state} and actions of {actual.action} numbers"
         needed = f"{widths.state} and {widths.action}, as in the other episodes"
-        fix = "Keep the recordings of different robots in different data sets"
+        fix = "Keep the recordings of different robots in separate data sets"
         raise InputError(where=f"episode {episode.info.id}", found=problem, needed=needed, fix=fix)

@@ -18,8 +18,8 @@ from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
 
 CONNECTIONS = 16  # concurrent reads of remote data per process
-DEEPEST = 8  # levels of folders below the data set's folder
-_QUEUED = 4096  # submitted tasks at most, which limits the memory for data sets of 100,000 episodes
+MAX_DEPTH = 8  # levels of subfolders that are searched for episodes
+_MAX_QUEUED = 4096  # submitted tasks; the limit saves memory for data sets of 100,000 episodes
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -58,7 +58,8 @@ class EpisodeFiles:
         """Return the content of a file.
 
         Raises:
-            InputError: There is no such file. An UnreachableError if the file cannot be read.
+            InputError: There is no such file.
+            UnreachableError: The file cannot be read now.
         """
         with storage.translate_read_errors(path, fix="Copy the episode again"):
             if storage.is_url(path):
@@ -66,7 +67,7 @@ class EpisodeFiles:
             return storage.read_bytes(path)
 
     def read_parsed(self, key: str, parse: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
-        """Return arrays from the disk cache, or parse them now and cache the result."""
+        """Return the arrays that the disk cache has under a key, or parse them now and cache them."""
         if (data := self.cache.read(key)) is not None:
             with suppress(InvalidTableError):
                 return unpack(data)[0]
@@ -87,8 +88,8 @@ def map_in_threads(function: Callable[[Item], Result], items: Sequence[Item], co
         return
     pool = ThreadPoolExecutor(min(connections, len(items)))
     try:
-        for start in range(0, len(items), _QUEUED):
-            yield from pool.map(function, items[start : start + _QUEUED])
+        for start in range(0, len(items), _MAX_QUEUED):
+            yield from pool.map(function, items[start : start + _MAX_QUEUED])
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -96,14 +97,14 @@ def map_in_threads(function: Callable[[Item], Result], items: Sequence[Item], co
 def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
     """Yield (folder relative to `root`, file) of all files below `root`; names that begin with a dot are skipped.
 
-    A folder that several links lead to is visited once, so that its files are not episodes under several names.
+    A folder that several links point to is visited once, so that none of its episodes has two identities.
 
     Raises:
         OSError: A folder cannot be listed.
         InputError: A name is not UTF-8.
     """
     folders, visited = [""], {storage.canonical_path(root)}
-    for _ in range(DEEPEST):
+    for _ in range(MAX_DEPTH):
         subfolders: list[str] = []
         listings = map_in_threads(lambda folder: list_folder(root, folder), folders, connections)
         for folder, (files, names) in zip(folders, listings, strict=True):
@@ -123,8 +124,8 @@ def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
     """
     path = storage.join(root, folder)
     entries = storage.list_folder(path)
-    for entry in entries:  # identities of episodes must be encodable as UTF-8
-        if not entry.name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in entry.name):
+    for entry in entries:  # the names become identities of episodes, which are stored as UTF-8
+        if not entry.name.isascii() and any("\ud800" <= character <= "\udfff" for character in entry.name):
             raise InputError(
                 where=path, found=f"the name {entry.name!r}", needed="names in UTF-8", fix="Rename the file or folder"
             )

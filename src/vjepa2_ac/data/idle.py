@@ -1,4 +1,4 @@
-"""Idle time: the ranges of steps in which the robot moves, computed by a rule or read from a list, cached on disk."""
+"""Find the steps in which the robot moves, by a rule or from a published list, and cache the result on disk."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from vjepa2_ac.storage.structured import read_json_object, short_repr
 
 logger = logging.getLogger(__name__)
 
-_MOST_BYTES = 1 << 28  # size limit of a published list
-_ALL_BROKEN = 10  # if the first ten episodes are all broken, a setting is wrong, and the first error is raised
+_MAX_BYTES = 1 << 28  # size limit of a published list
+_NUM_TRIED = 10  # if all of the first ten episodes are broken, a setting is probably wrong, so an error is raised
 
 RangesOrProblem = list[tuple[int, int]] | EpisodeProblem
 
@@ -35,7 +35,7 @@ RangesOrProblem = list[tuple[int, int]] | EpisodeProblem
 def find_ranges(
     source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress | None
 ) -> StepSelection:
-    """Return the ranges that `data.idle.rule` keeps, for all episodes, including unused ones.
+    """Return the ranges of steps that `data.idle.rule` keeps, also for episodes that other filters remove.
 
     Raises:
         InputError: The list of ranges cannot be read or belongs to another data set, or the rule cannot be applied to
@@ -46,7 +46,7 @@ def find_ranges(
     make = partial(_compute_ranges, source, table, config, progress or no_progress)
     if config.idle.rule == "published":
         path = str(config.idle.ranges)
-        make = partial(published_ranges, path, table)
+        make = partial(read_published_ranges, path, table)
         with storage.translate_read_errors(path):
             parts["list"] = [storage.canonical_path(path), storage.file_size(path), storage.file_version(path)]
     return get_or_build(config.disk_cache, hash_key(parts), make, StepSelection)
@@ -55,33 +55,33 @@ def find_ranges(
 def _compute_ranges(
     source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress
 ) -> StepSelection:
-    def ranges_of(index: int) -> RangesOrProblem:
+    def find_ranges_at(index: int) -> RangesOrProblem:
         try:
             return find_selected_ranges(source.read(index), config.idle)
         except InputError as error:
             return EpisodeProblem.from_error(error, table.identity(index))
 
     results: list[RangesOrProblem] = []
-    for result in map_in_threads(ranges_of, range(len(table)), num_connections(config)):
+    for result in map_in_threads(find_ranges_at, range(len(table)), num_connections(config)):
         results.append(result)
         progress(len(results), len(table))
-        if len(results) == min(_ALL_BROKEN, len(table)):
+        if len(results) == min(_NUM_TRIED, len(table)):
             problems = [problem for problem in results if isinstance(problem, EpisodeProblem)]
             if len(problems) == len(results):
                 raise problems[0].error
     return StepSelection.from_ranges(results)
 
 
-def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
-    """Return the ranges in a published list; see `data.idle.ranges`.
+def read_published_ranges(path: str, table: EpisodeTable) -> StepSelection:
+    """Read the ranges of all episodes from a published list; see `data.idle.ranges`.
 
     Raises:
-        InputError: The list cannot be read, has no episode of the table, or has invalid ranges.
+        InputError: The list cannot be read, contains none of the episodes, or has invalid ranges.
     """
     where = f"data.idle.ranges: {path}"
     needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
     fix = "Use the list for this version of the data set, or set data.idle.rule: commands or motion"
-    ranges_by_identity = read_json_object(path, max_bytes=_MOST_BYTES, needed=needed)
+    ranges_by_identity = read_json_object(path, max_bytes=_MAX_BYTES, needed=needed)
     names = [table.identity(index) for index in range(len(table))]
     num_listed = sum(name in ranges_by_identity for name in names)
     if not num_listed:
@@ -109,7 +109,7 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
 
 
 def _parse_ranges(ranges: object, steps: int) -> list[tuple[int, int]] | None:
-    """Return the sorted ranges of one episode; None if they are not pairs of its steps or overlap."""
+    """Return the ranges of one episode in order; None if they overlap or are not pairs of steps of the episode."""
     try:
         pairs = sorted((start, end) for start, end in ranges)  # type: ignore[attr-defined] # see the except clause
         edges = [edge for pair in pairs for edge in pair]
@@ -120,45 +120,47 @@ def _parse_ranges(ranges: object, steps: int) -> list[tuple[int, int]] | None:
 
 
 def find_selected_ranges(episode: Episode, config: IdleConfig) -> list[tuple[int, int]]:
-    """Return the ranges [start, end) of steps that an episode keeps under the rule `commands` or `motion`.
+    """Return the ranges [start, end) of an episode's steps that the rule `commands` or `motion` keeps.
 
     Raises:
         InputError: The rule is `commands` and the joint velocities are missing or not finite.
     """
     if config.rule == "motion":
-        return moving_ranges(idle_by_motion(episode.states, config), config)
+        return find_moving_ranges(find_idle_by_motion(episode.states, config), config)
     where, velocities = f"episode {episode.info.id}", episode.joint_velocities
     if velocities is None:
         fix = "Set data.idle.rule: motion, which needs only poses, or set the key for the feature with the velocities"
         raise InputError(where=where, found="no commanded joint velocities", fix=fix)
     if not np.isfinite(velocities).all():
         raise InputError(where=where, found="a joint velocity that is not finite", needed="finite numbers")
-    return moving_ranges(idle_by_commands(velocities, config), config)
+    return find_moving_ranges(find_idle_by_commands(velocities, config), config)
 
 
-def idle_by_commands(velocities: Float[np.ndarray, "steps joints"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
+def find_idle_by_commands(
+    velocities: Float[np.ndarray, "steps joints"], config: IdleConfig
+) -> Bool[np.ndarray, " steps"]:
     """Return a mask of the steps at which no commanded joint velocity changes; False at the first step.
 
     Source: Physical-Intelligence/openpi @ 15a9616, examples/droid/compute_droid_nonidle_ranges.py.
     """
-    still = (abs(np.diff(velocities, axis=0)) < config.velocity_change_rad_s).all(axis=1)
-    return np.concatenate([np.zeros(min(1, len(velocities)), bool), still])
+    is_still = (abs(np.diff(velocities, axis=0)) < config.velocity_change_rad_s).all(axis=1)
+    return np.concatenate([np.zeros(min(1, len(velocities)), bool), is_still])
 
 
-def idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
+def find_idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
     """Return a mask of the steps at which the measured pose changes less than the thresholds; False at the first."""
     if len(states) < 2:
         return np.zeros(len(states), bool)
     motion = POSE.compute_differences(states.astype(np.float64))
-    still = (
+    is_still = (
         (np.linalg.norm(motion[:, POSE.position], axis=1) < config.translation_m)
         & (rotation_angles(motion[:, POSE.rotation]) < config.rotation_rad)
         & (abs(motion[:, POSE.gripper]) < config.gripper)
     )
-    return np.concatenate([[False], still])
+    return np.concatenate([[False], is_still])
 
 
-def long_idle_runs(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
+def find_long_idle(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
     """Return a mask of the steps in idle runs of at least `data.idle.shortest_idle_steps` steps."""
     is_long = np.zeros(len(idle), bool)
     for start, end in find_runs(idle):
@@ -166,13 +168,13 @@ def long_idle_runs(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> Bool
     return is_long
 
 
-def moving_ranges(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> list[tuple[int, int]]:
-    """Return the ranges that remain after removing long idle runs, short ranges between them, and the end of each.
+def find_moving_ranges(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> list[tuple[int, int]]:
+    """Return the ranges that remain without long idle runs, then without short ranges and the last steps of each range.
 
     Source: Physical-Intelligence/openpi @ 15a9616, examples/droid/compute_droid_nonidle_ranges.py.
     """
-    moving, cut = find_runs(~long_idle_runs(idle, config)), config.cut_last_steps
-    ranges = [(start, end) for start, end in moving if end - start >= config.shortest_kept_steps]
+    moving_runs, cut = find_runs(~find_long_idle(idle, config)), config.cut_last_steps
+    ranges = [(start, end) for start, end in moving_runs if end - start >= config.shortest_kept_steps]
     return [(start, end - cut) for start, end in ranges if end - cut > start]
 
 

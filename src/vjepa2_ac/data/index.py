@@ -1,4 +1,4 @@
-"""The index of a data set: facts about every episode, stored as columns and cached, so that a set is scanned once.
+"""The index of a data set: facts about every episode, stored as columns and cached, so that it is built only once.
 
 DROID has 95,658 episodes. A list of that many objects is slow to load and to send to workers; a table of columns is
 small and fast.
@@ -31,14 +31,14 @@ logger = logging.getLogger(__name__)
 
 UNKNOWN = 0  # `state_hash` of an episode whose states were not read; `hash_states` never returns it
 
-_NOT_KNOWN = -1  # in the columns of labels and of success
+_UNKNOWN_NUMBER = -1  # value in the columns of labels and success
 _COLUMNS = ("num_steps", "success", "ids", "id_hash", "id_rank")
 _HASH, _MOTION, _LOCATOR, _LABEL = "state_hash", "motion", "locator.", "label."
 _TEXT = "text"
 _NO_MOTION = (np.nan,) * 8
 MEANS, SPANS = slice(2, 5), slice(5, 8)  # parts of `StatesSummary.motion`
-_CACHE = "VJEPA2_AC_CACHE"
-_VERSION = 5  # of the cache; a new number invalidates all entries
+_CACHE_VARIABLE = "VJEPA2_AC_CACHE"
+_VERSION = 5  # version of the cached files; a new number invalidates all of them
 
 
 class InvalidTableError(ValueError):
@@ -46,14 +46,14 @@ class InvalidTableError(ValueError):
 
 
 def pack(arrays: Mapping[str, np.ndarray], text: object = None) -> bytes:
-    """Serialise arrays and a JSON value reproducibly to the bytes of a file."""
+    """Serialise arrays and a JSON value to the bytes of a file; equal values give equal bytes."""
     file = io.BytesIO()
-    np.savez(file, **{_TEXT: np.frombuffer(json.dumps(text).encode(), np.uint8)}, **arrays)  # type: ignore[arg-type] # none is called allow_pickle
+    np.savez(file, **{_TEXT: np.frombuffer(json.dumps(text).encode(), np.uint8)}, **arrays)  # type: ignore[arg-type] # no array has the name allow_pickle
     return file.getvalue()
 
 
 def unpack(data: bytes) -> tuple[dict[str, np.ndarray], Any]:
-    """Return the arrays and the JSON value of `pack`; nothing is unpickled or expands beyond the file's size.
+    """Return the arrays and the JSON value that `pack` wrote; pickled and compressed arrays are refused.
 
     Raises:
         InvalidTableError: The bytes are another kind of file, or damaged.
@@ -64,7 +64,7 @@ def unpack(data: bytes) -> tuple[dict[str, np.ndarray], Any]:
                 raise InvalidTableError("compressed or damaged arrays")  # noqa: TRY301
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = dict(file)
-        text = arrays.pop("problems" if "problems" in arrays else _TEXT)  # "problems": ranges of older versions
+        text = arrays.pop("problems" if "problems" in arrays else _TEXT)  # "problems": the name in older caches
         return arrays, json.loads(text.tobytes())
     except Exception as error:  # zipfile and numpy raise many types of errors for damaged files
         raise InvalidTableError(str(error)[:200] or type(error).__name__) from None
@@ -96,11 +96,11 @@ class Labels:
     """One name for each episode, as an index into a list of all names."""
 
     names: tuple[str, ...]
-    number: Int32[np.ndarray, " episodes"]  # into the names; -1: unknown
+    number: Int32[np.ndarray, " episodes"]  # index into the names; -1: unknown
 
     def __post_init__(self) -> None:
         """Refuse numbers outside the list of names, which a damaged file may contain."""
-        if len(self.number) and not _NOT_KNOWN <= self.number.min() <= self.number.max() < len(self.names):
+        if len(self.number) and not _UNKNOWN_NUMBER <= self.number.min() <= self.number.max() < len(self.names):
             raise ValueError(f"labels of {len(self.names)} names with numbers up to {self.number.max()}")
 
     @classmethod
@@ -108,12 +108,12 @@ class Labels:
         """Create labels; None or an empty name means unknown."""
         names = sorted({value for value in values if value})
         number = {name: index for index, name in enumerate(names)}
-        return cls(tuple(names), np.array([number.get(value or "", _NOT_KNOWN) for value in values], np.int32))
+        return cls(tuple(names), np.array([number.get(value or "", _UNKNOWN_NUMBER) for value in values], np.int32))
 
     def name_at(self, index: int) -> str | None:
         """Return the name of one episode, or None if unknown."""
         number = int(self.number[index])
-        return None if number == _NOT_KNOWN else self.names[number]
+        return None if number == _UNKNOWN_NUMBER else self.names[number]
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
 
     num_steps: Int32[np.ndarray, " episodes"]
     success: Int8[np.ndarray, " episodes"]  # 1, 0, or -1: unknown
-    ids: np.ndarray  # the identities as UTF-8, of type S
+    ids: np.ndarray  # the identities in UTF-8, as NumPy bytes (type S)
     id_hash: UInt64[np.ndarray, " episodes"]  # the first 8 bytes of the identity's SHA-256
     id_rank: Int32[np.ndarray, " episodes"]  # rank of the identity in alphabetical order
     motion: Float32[np.ndarray, "episodes 8"]  # as in `StatesSummary`; NaN: states not read, or an older latent cache
@@ -151,7 +151,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         ids = np.array([info.id.encode() for info in infos] or [b""])[: len(infos)]
         return cls(
             num_steps=np.array([info.num_steps for info in infos], np.int32),
-            success=np.array([_NOT_KNOWN if info.success is None else info.success for info in infos], np.int8),
+            success=np.array([_UNKNOWN_NUMBER if info.success is None else info.success for info in infos], np.int8),
             ids=ids,
             id_hash=np.array([hash_identity(info.id) for info in infos], np.uint64),
             id_rank=np.argsort(np.argsort(ids, kind="stable")).astype(np.int32),
@@ -167,7 +167,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         return EpisodeInfo(
             id=self.identity(index),
             num_steps=int(self.num_steps[index]),
-            success=None if success == _NOT_KNOWN else bool(success),
+            success=None if success == _UNKNOWN_NUMBER else bool(success),
         )
 
     def identity(self, index: int) -> str:
@@ -230,7 +230,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
 
 @dataclass(frozen=True, eq=False)
 class StepSelection:
-    """Ranges [start, end) of control steps that a clip must fit into, by episode, then ascending and disjoint."""
+    """Disjoint ranges [start, end) of control steps, sorted by episode and start; a clip must fit into one range."""
 
     episode: Int32[np.ndarray, " ranges"]  # index into the table
     start: Int32[np.ndarray, " ranges"]
@@ -239,20 +239,20 @@ class StepSelection:
 
     @classmethod
     def all_steps(cls, table: EpisodeTable, is_selected: Bool[np.ndarray, " episodes"]) -> StepSelection:
-        """Return a selection of all steps of the used episodes."""
+        """Return the selection of all steps of the episodes of a mask."""
         episode = np.flatnonzero(is_selected).astype(np.int32)
         return cls(episode, np.zeros(len(episode), np.int32), table.num_steps[episode])
 
     @classmethod
     def from_ranges(cls, results: Sequence[list[tuple[int, int]] | EpisodeProblem]) -> StepSelection:
         """Create a selection from the ranges or the problem of each episode."""
-        problems = tuple((index, part) for index, part in enumerate(results) if isinstance(part, EpisodeProblem))
-        ranges = [(index, *pair) for index, part in enumerate(results) if isinstance(part, list) for pair in part]
+        problems = tuple((index, result) for index, result in enumerate(results) if isinstance(result, EpisodeProblem))
+        ranges = [(index, *pair) for index, pairs in enumerate(results) if isinstance(pairs, list) for pair in pairs]
         episode, start, end = np.ascontiguousarray(np.array(ranges, np.int32).reshape(-1, 3).T)
         return cls(episode, start, end, problems)
 
     def select_episodes(self, episodes: Bool[np.ndarray, " episodes"]) -> StepSelection:
-        """Return the part of the selection that belongs to a mask of episodes."""
+        """Return the selection without the episodes that are not in a mask."""
         selected = episodes[self.episode]
         return replace(self, episode=self.episode[selected], start=self.start[selected], end=self.end[selected])
 
@@ -314,9 +314,9 @@ def hash_states(states: Float[np.ndarray, "steps state_dim"]) -> int:
     """Return 64 bits of the BLAKE2b of the states as float32, never `UNKNOWN`.
 
     The states are hashed as float32, because a recording may be float64 in one file and float32 in another. Coarser
-    rounding would not make other roundings agree: a value at the edge of a grid cell may be rounded to either side.
+    rounding would not help, because two nearly equal values may still be rounded to different numbers.
     """
-    content = f"{states.shape} ".encode() + (states.astype("<f4") + np.float32(0)).tobytes()  # -0 is 0
+    content = f"{states.shape} ".encode() + (states.astype("<f4") + np.float32(0)).tobytes()  # + 0 converts -0 to 0
     return int.from_bytes(hashlib.blake2b(content, digest_size=8).digest(), "big") or 1
 
 
@@ -338,9 +338,9 @@ STATES_NOT_READ = StatesSummary()
 def summarize_states(states: Float[np.ndarray, "steps state_dim"]) -> StatesSummary:
     """Summarise the states of an episode with one or more steps."""
     width = states.shape[1]
-    fastest = compute_step_sizes(states).max(axis=0, initial=0.0) if width == STATE_DIM else np.zeros(2)
+    largest = compute_step_sizes(states).max(axis=0, initial=0.0) if width == STATE_DIM else np.zeros(2)
     positions = states[:, np.arange(3) % width]
-    return StatesSummary(hash_states(states), [*fastest, *positions.mean(axis=0), *positions.std(axis=0)])
+    return StatesSummary(hash_states(states), [*largest, *positions.mean(axis=0), *positions.std(axis=0)])
 
 
 def cache_folder(config: DiskCacheConfig) -> Path:
@@ -351,11 +351,11 @@ def cache_folder(config: DiskCacheConfig) -> Path:
     """
     if config.dir is not None:
         return Path(config.dir)
-    if configured := os.environ.get(_CACHE):
+    if configured := os.environ.get(_CACHE_VARIABLE):
         try:
             return Path(paths.resolve_local_path(configured))
         except ValueError as error:
-            raise InputError(where=_CACHE, found=f"{configured!r} {error}", needed="a local folder") from None
+            raise InputError(where=_CACHE_VARIABLE, found=f"{configured!r} {error}", needed="a local folder") from None
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
 
 
@@ -380,14 +380,14 @@ def index_key(parts: Mapping[str, object], path: str, *, identity: str = "") -> 
 
 
 def compute_fingerprint(table: EpisodeTable) -> str:
-    """Return a fingerprint of the episodes: the key of their index, or a hash of the table."""
+    """Return a fingerprint of the episodes: the key of the index, or a hash of a table without a key."""
     return table.texts.get("index") or hashlib.sha256(table.to_bytes()).hexdigest()
 
 
 def get_or_build_index(config: DiskCacheConfig, key: str, path: str, build: Callable[[], EpisodeTable]) -> EpisodeTable:
-    """Return the table cached under a key; build and cache it if it is missing or damaged. `texts` contains the key.
+    """Return the table cached under a key; build and cache it if it is missing or damaged.
 
-    If the data set was moved, paths in cached problems are rewritten from the old folder to `path`.
+    `EpisodeTable.texts` contains the key. If the data set was moved, the paths in cached problems are updated.
     """
     folder = storage.canonical_path(path)
 

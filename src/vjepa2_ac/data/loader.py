@@ -76,7 +76,7 @@ class MixedDataset:
 
     dataset: Dataset
     replayed: Dataset | None = None
-    share: float = 0.0
+    share: float = 0.0  # fraction of the clips that are from `replayed`
 
 
 def training_loader(
@@ -117,8 +117,8 @@ def training_loader(
 
 def first_positions(share: ProcessShare, batch_size: int, *, start: int) -> Iterator[int]:
     """Yield the position of the first clip of each micro-batch of a process, endlessly."""
-    for before in itertools.count(0, share.micro_batches_per_step or share.processes):
-        yield from (start + (before + number) * batch_size for number in share.micro_batches)
+    for first_of_step in itertools.count(0, share.micro_batches_per_step or share.processes):
+        yield from (start + (first_of_step + number) * batch_size for number in share.micro_batches)
 
 
 def _training_clips(dataset: Dataset, seed: int) -> _MicroBatches:
@@ -130,7 +130,7 @@ def _training_clips(dataset: Dataset, seed: int) -> _MicroBatches:
 
 def _training_clip(config: DataConfig, order: ClipOrder, position: int) -> ClipRequest:
     """Return the request for the clip at a position of the endless sequence; the camera is drawn per clip."""
-    camera = config.cameras[order.choice(position, len(config.cameras))]
+    camera = config.cameras[order.draw_index(position, len(config.cameras))]
     return ClipRequest(*order.window(position), camera)
 
 
@@ -195,9 +195,10 @@ class _MicroBatches(TorchDataset[Batch]):
     share: Fraction = Fraction(0)  # share of clips from the second data set
 
     def __getitems__(self, positions: list[int]) -> Batch | UserError:
-        """Return a micro-batch, or its error, because DataLoader would change the type of a raised error.
+        """Return a micro-batch, or the error of reading it, because DataLoader would change the type of a raised error.
 
-        A worker moves the batch into shared memory here. PyTorch would do so in a thread, whose errors are lost.
+        A worker moves the batch into shared memory here. PyTorch would move it in the sending thread, whose errors
+        are lost.
         """
         before = storage.bytes_fetched()
         try:
@@ -206,22 +207,22 @@ class _MicroBatches(TorchDataset[Batch]):
             skipped = tuple(result for result in results if isinstance(result, SkippedClip))
             batch = collate(clips) if clips else empty_batch(self.dataset.config.frames, self.dataset.widths)
             batch = replace(batch, bytes_fetched=storage.bytes_fetched() - before, skipped=skipped)
-            return batch if get_worker_info() is None else _in_shared_memory(batch)
+            return batch if get_worker_info() is None else _move_to_shared_memory(batch)
         except UserError as error:
             return error
 
     def _read(self, positions: list[int]) -> list[Clip | SkippedClip]:
         datasets = [clips.dataset for clips in (self, self.replayed) if clips is not None]
         connections = max(num_connections(dataset.config) for dataset in datasets)
-        return list(map_in_threads(self._clip, positions, connections))
+        return list(map_in_threads(self._read_clip, positions, connections))
 
-    def _clip(self, position: int) -> Clip | SkippedClip:
+    def _read_clip(self, position: int) -> Clip | SkippedClip:
         if self.replayed is not None:
-            before, after = (int(number * self.share) for number in (position, position + 1))
-            if after > before:
-                clip = self.replayed._clip(before)
+            num_replayed_before, num_replayed = (int(count * self.share) for count in (position, position + 1))
+            if num_replayed > num_replayed_before:
+                clip = self.replayed._read_clip(num_replayed_before)
                 return replace(clip, replayed=True) if isinstance(clip, SkippedClip) else clip
-            position -= before
+            position -= num_replayed_before
         request = self.request_at(position)
         try:
             clip = read_clip(self.dataset, request)
@@ -234,7 +235,7 @@ class _MicroBatches(TorchDataset[Batch]):
 
 
 class Batches(Iterator[Batch]):
-    """The batches of a loader, in order; errors and skipped clips are reported when their batch is requested.
+    """The batches of a loader, in order. The errors and skipped clips of a batch are reported when it is requested.
 
     Args:
         results: The results of the workers: micro-batches or errors.
@@ -256,14 +257,14 @@ class Batches(Iterator[Batch]):
         Raises:
             InputError: A clip cannot be read, here or in a worker; or too many episodes are broken.
         """
-        row = next(self._results)
-        if isinstance(row, UserError):
+        result = next(self._results)
+        if isinstance(result, UserError):
             self.close()
-            raise row
-        for clip in row.skipped:
+            raise result
+        for clip in result.skipped:
             broken = self._replayed if clip.replayed and self._replayed is not None else self._broken
             broken.record(clip.episode_id, clip.reason)
-        return row
+        return result
 
     def close(self) -> None:
         """End the workers."""
@@ -287,7 +288,7 @@ def map_in_workers(
     Raises:
         UnreachableError: A worker has ended, or no result arrived shortly after a stop signal.
     """
-    # A fork server has no threads, whereas a plain fork may hang in OpenMP or CUDA, as Python warns.
+    # Workers are forked from a server without threads, because a fork of this process may hang in OpenMP or CUDA.
     context = multiprocessing.get_context("forkserver") if workers else None
     if context is not None:
         context.set_forkserver_preload(["vjepa2_ac.data.loader"])
@@ -305,15 +306,15 @@ def map_in_workers(
         pin_memory=pinned,
     )
     other_children = set(multiprocessing.active_children())
-    rows = iter(loader)
+    results = iter(loader)
     worker_processes = set(multiprocessing.active_children()) - other_children
     at_exit = partial(_end_workers, worker_processes)
     atexit.register(at_exit)  # multiprocessing would send SIGTERM and wait for workers that ignore it
     try:
-        while (row := _next_row(rows, worker_processes)) is not None:
-            yield row
+        while (result := _next_result(results, worker_processes)) is not None:
+            yield result
     finally:
-        del rows  # PyTorch requests the workers to end, and waits for them for a limited time
+        del results  # PyTorch requests the workers to end, and waits for them for a limited time
         _end_workers(worker_processes)
         atexit.unregister(at_exit)
 
@@ -322,12 +323,12 @@ def _identity(batch: Any) -> Any:
     return batch
 
 
-def _next_row(rows: Iterator[Any], workers: Iterable[BaseProcess]) -> Any:
-    """Return the next result, or None at the end; errors as for `map_in_workers`."""
+def _next_result(results: Iterator[Any], workers: Iterable[BaseProcess]) -> Any:
+    """Return the next result, or None at the end; raises the errors of `map_in_workers`."""
     started = time.monotonic()
     while True:
         try:
-            return next(rows, None)
+            return next(results, None)
         except RuntimeError as error:
             if dead := [worker for worker in workers if not worker.is_alive()]:
                 problem = f"a loader worker has ended unexpectedly (exit code {dead[0].exitcode})"
@@ -358,14 +359,14 @@ def _start_servers() -> None:
     A signal to the whole process group, as from a terminal, `timeout` or Slurm, must reach only the run, which needs
     its workers to finish the step and then ends them.
     """
-    stop = {signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP}
-    for start in (resource_tracker.ensure_running, forkserver.ensure_running):  # the first one unblocks the signals
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, stop)
+    stop_signals = {signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP}
+    for start in (resource_tracker.ensure_running, forkserver.ensure_running):  # the tracker unblocks the signals
+        previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, stop_signals)
         try:
             with safe_imports():
                 start()
         finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
 
 
 # ---- in a worker ----
@@ -379,13 +380,13 @@ def _prepare_worker(_worker: int) -> None:
     wait for the batch forever.
     """
     queues.Queue._on_queue_feeder_error = staticmethod(_end_without_sending)  # type: ignore[attr-defined]  # untyped
-    run = multiprocessing.parent_process()
-    if run is None:
+    run_process = multiprocessing.parent_process()
+    if run_process is None:
         raise ValueError("not in a worker")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run handles Ctrl-C and ends its workers
 
     def watch() -> None:
-        run.join()
+        run_process.join()
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
@@ -400,10 +401,10 @@ def _end_without_sending(error: BaseException, _batch: object) -> None:
 
 
 def require_shared_memory(data: DataConfig, batch_bytes: float, processes: int = 1) -> None:
-    """Check that shared memory has space for the prefetched batches of all workers; containers have 64 MB by default.
+    """Refuse a shared memory that is too small for the prefetched batches; in containers it has 64 MB by default.
 
     Args:
-        data: The config.
+        data: The config, which has the number of workers.
         batch_bytes: Size of a batch in bytes.
         processes: Number of processes of the run on this machine.
 
@@ -414,14 +415,14 @@ def require_shared_memory(data: DataConfig, batch_bytes: float, processes: int =
     free = shutil.disk_usage(SHARED_MEMORY).free if SHARED_MEMORY.is_dir() else math.inf
     if needed > free:
         workers = counted(processes * data.workers, "worker")
-        required = f"{_megabytes(needed)} for {workers} x {PREFETCH} prefetched batches of {_megabytes(batch_bytes)}"
+        required = f"{_format_mb(needed)} for {workers} x {PREFETCH} prefetched batches of {_format_mb(batch_bytes)}"
         raise UnreachableError(
-            where=str(SHARED_MEMORY), found=f"{_megabytes(free)} free", needed=required, fix=_MORE_SHARED_MEMORY
+            where=str(SHARED_MEMORY), found=f"{_format_mb(free)} free", needed=required, fix=_MORE_SHARED_MEMORY
         )
 
 
-def _in_shared_memory(batch: Batch) -> Batch:
-    """Move a batch into shared memory. PyTorch would do so in the thread that sends the batch, whose errors are lost.
+def _move_to_shared_memory(batch: Batch) -> Batch:
+    """Move the tensors of a batch into shared memory.
 
     Raises:
         UnreachableError: There is too little shared memory.
@@ -429,9 +430,9 @@ def _in_shared_memory(batch: Batch) -> Batch:
     try:
         return batch.map_tensors(Tensor.share_memory_)
     except RuntimeError as error:
-        problem = f"not enough space for a batch of {_megabytes(batch.nbytes)} from a loader worker ({error})"
+        problem = f"not enough space for a batch of {_format_mb(batch.nbytes)} from a loader worker ({error})"
         raise UnreachableError(where=str(SHARED_MEMORY), found=problem, fix=_MORE_SHARED_MEMORY) from None
 
 
-def _megabytes(size: float) -> str:
+def _format_mb(size: float) -> str:
     return f"{size / 1e6:.3g} MB"

@@ -31,27 +31,27 @@ _JUMP, _JUMP_RATIO = 1.5, 6.0  # a jump exceeds this change of the numbers and t
 _STEPS_AROUND = 5  # steps on either side of a jump
 _MIN_ANGLE_RAD = 0.005  # lower bound of a step's angle, because smaller angles are rounding errors
 _SMOOTH, _ABRUPT = 3.0, 9.0  # limits of a step's angle relative to the steps around it
-_CLEAR_MAJORITY = 5  # least ratio of jumps that favour another format to jumps that favour the configured one
+_CLEAR_MAJORITY = 5  # smallest ratio of jumps that favour another format to jumps that favour the configured one
 
 
-def num_rotation_numbers(written_as: RotationFormat) -> int:
-    """Return the number of numbers of a rotation: 4 for quaternions, 3 for the other formats."""
-    return 4 if written_as.startswith("quaternion") else 3
+def num_rotation_numbers(rotation_format: RotationFormat) -> int:
+    """Return how many numbers describe a rotation: 4 for quaternions, 3 in the other formats."""
+    return 4 if rotation_format.startswith("quaternion") else 3
 
 
-def convert_rotations(numbers: Float[np.ndarray, "steps _"], written_as: RotationFormat) -> Rotation:
-    """Convert rotation numbers of a format to SciPy rotations.
+def convert_rotations(numbers: Float[np.ndarray, "steps _"], rotation_format: RotationFormat) -> Rotation:
+    """Convert rotations from the numbers of a format to SciPy rotations.
 
     Raises:
         ValueError: A quaternion is zero.
     """
-    if written_as == "quaternion_xyzw":
+    if rotation_format == "quaternion_xyzw":
         return Rotation.from_quat(numbers)
-    if written_as == "quaternion_wxyz":
+    if rotation_format == "quaternion_wxyz":
         return Rotation.from_quat(np.roll(numbers, -1, axis=1))
-    if written_as == "rotation_vector":
+    if rotation_format == "rotation_vector":
         return Rotation.from_rotvec(numbers)
-    return Rotation.from_euler("xyz", numbers, degrees=written_as == "euler_xyz_degrees")
+    return Rotation.from_euler("xyz", numbers, degrees=rotation_format == "euler_xyz_degrees")
 
 
 def convert_poses(
@@ -66,10 +66,13 @@ def convert_poses(
         section: The config section of the fields, such as data.lerobot.
 
     Raises:
-        InputError: The poses are implausible in this format: a quaternion is not of unit length, or out of reach.
+        InputError: The poses are implausible in this format, such as positions out of reach or quaternions of other
+                lengths than 1.
     """
     fix = f"Check {section}: state, select, rotation, position_unit, gripper_open and gripper_closed"
-    require_plausible = partial(POSE.require_plausible, where=where, fix=fix, conversions=_conversions(fields, section))
+    require_plausible = partial(
+        POSE.require_plausible, where=where, fix=fix, conversions=_get_unit_fixes(fields, section)
+    )
     positions, rotation = numbers[:, :3] * _METRES[fields.position_unit], numbers[:, 3:-1]
     gripper = (numbers[:, -1:] - fields.gripper_open) / (fields.gripper_closed - fields.gripper_open)
     if num_rotation_numbers(fields.rotation) == 4:
@@ -84,8 +87,8 @@ def convert_poses(
     return states
 
 
-def _conversions(fields: PoseFields, section: str) -> dict[str, str]:
-    """Return the fix for numbers that seem to be in another unit, by the name of that unit."""
+def _get_unit_fixes(fields: PoseFields, section: str) -> dict[str, str]:
+    """Return how to configure other units, by the name of the unit that the numbers seem to have."""
     conversions = {}
     if fields.position_unit == "m":
         conversions = {unit: f"set {section}.position_unit: {unit[0]}m" for unit in ("millimetres", "centimetres")}
@@ -97,7 +100,7 @@ def _conversions(fields: PoseFields, section: str) -> dict[str, str]:
 def require_selection(
     columns: Mapping[str, int], fields: PoseFields, section: str, *, is_pose: bool, episode: str = ""
 ) -> None:
-    """Refuse a `select` with indices out of range, and a number of columns that does not form a pose.
+    """Refuse a `select` with indices out of range, or numbers that do not form a pose.
 
     Args:
         columns: The width of each column of `state`, by its description.
@@ -129,7 +132,7 @@ def require_selection(
 
 def _require_unit_quaternions(quaternions: Float[np.ndarray, "steps 4"], where: str, fix: str) -> None:
     lengths = np.linalg.norm(quaternions, axis=1)
-    is_wrong = ~(abs(lengths - 1) <= _UNIT_TOLERANCE)  # NaN is wrong, too
+    is_wrong = ~(abs(lengths - 1) <= _UNIT_TOLERANCE)  # ~(<=) is also true for NaN
     if is_wrong.any():
         step = int(is_wrong.argmax())
         problem = f"the quaternion {np.array2string(quaternions[step], precision=4)} of length {lengths[step]:.4g}"
@@ -153,7 +156,7 @@ class RotationSpeeds:
 
     @property
     def num_smooth_jumps(self) -> int:
-        """The number of jumps at which the hand turns about as fast as at the steps around, as in the right format."""
+        """The number of jumps at which the hand turns about as fast as at the steps around, as expected."""
         return int((self.at_jumps <= _SMOOTH).sum())
 
     def num_smoother_than(self, other: RotationSpeeds) -> int:
@@ -175,54 +178,53 @@ def measure_rotation_speeds(
     Returns:
         Speeds by format. Formats in radians are absent if a number is too large for radians.
     """
-    numbers = [_without_repetitions(episode) for episode in episodes]
+    numbers = [_remove_repetitions(episode) for episode in episodes]
     numbers = [episode for episode in numbers if len(episode) > 1]
     largest = max((float(abs(episode).max()) for episode in numbers), default=0.0)
     jumps = [_find_jumps(episode) for episode in numbers]
     speeds: dict[RotationFormat, RotationSpeeds] = {}
-    for written_as in FORMATS:
-        if written_as != "euler_xyz_degrees" and largest > MAX_ANGLE_RAD:
+    for rotation_format in FORMATS:
+        if rotation_format != "euler_xyz_degrees" and largest > MAX_ANGLE_RAD:
             continue
-        angles = [_step_angles(episode, written_as) for episode in numbers]
+        angles = [_compute_step_angles(episode, rotation_format) for episode in numbers]
         ratios = [
-            _relative_to_neighbours(episode_angles, is_jump)
+            _compare_with_neighbours(episode_angles, is_jump)
             for episode_angles, is_jump in zip(angles, jumps, strict=True)
         ]
         median = float(np.median(np.concatenate(angles))) * control_rate_hz if angles else 0.0
-        speeds[written_as] = RotationSpeeds(median, np.concatenate([np.zeros(0), *ratios]))
+        speeds[rotation_format] = RotationSpeeds(median, np.concatenate([np.zeros(0), *ratios]))
     return speeds
 
 
 def find_smoother_format(
-    speeds: Mapping[RotationFormat, RotationSpeeds], written_as: RotationFormat, max_rad_s: float
+    speeds: Mapping[RotationFormat, RotationSpeeds], rotation_format: RotationFormat, max_rad_s: float
 ) -> RotationFormat | None:
     """Return the format in which the hand turns much more smoothly than in the configured one, or None.
 
-    tests/data/test_rotation_formats.py tests random smooth motions in all three formats. If the hand points down (roll
-    near pi), the numbers usually jump. If the hand is tilted by more than it moves, or is near its zero rotation, the
-    numbers never jump, and a wrong format is not detected. Numbers in degrees are detected if one of them is too large
-    for radians.
+    A wrong format is only detected if the numbers jump, or if numbers in degrees are too large for radians. Numbers
+    usually jump if the hand points down (roll near pi). They do not jump if no angle passes pi, for example near the
+    zero rotation. tests/data/test_rotation_formats.py tests random smooth motions in all three formats.
 
     Args:
         speeds: The result of `measure_rotation_speeds`.
-        written_as: The configured format.
+        rotation_format: The configured format.
         max_rad_s: The largest possible median speed; if it is exceeded, the numbers are degrees.
     """
-    if num_rotation_numbers(written_as) == 4:
+    if num_rotation_numbers(rotation_format) == 4:
         return None
-    configured = speeds.get(written_as)
+    configured = speeds.get(rotation_format)
     if configured is None or configured.median_rad_s > max_rad_s:
-        return "euler_xyz_degrees" if written_as != "euler_xyz_degrees" else None
-    gains = {other: other_speeds.num_smoother_than(configured) for other, other_speeds in speeds.items()}
-    clear = [
+        return "euler_xyz_degrees" if rotation_format != "euler_xyz_degrees" else None
+    num_smoother = {other: other_speeds.num_smoother_than(configured) for other, other_speeds in speeds.items()}
+    candidates = [
         other
-        for other, gain in gains.items()
-        if gain >= MIN_JUMPS and gain > _CLEAR_MAJORITY * configured.num_smoother_than(speeds[other])
+        for other, count in num_smoother.items()
+        if count >= MIN_JUMPS and count > _CLEAR_MAJORITY * configured.num_smoother_than(speeds[other])
     ]
-    return max(clear, key=lambda other: gains[other], default=None)
+    return max(candidates, key=lambda other: num_smoother[other], default=None)
 
 
-def _without_repetitions(numbers: Float[np.ndarray, "steps 3"]) -> Float[np.ndarray, "changing 3"]:
+def _remove_repetitions(numbers: Float[np.ndarray, "steps 3"]) -> Float[np.ndarray, "changing 3"]:
     """Remove steps whose numbers equal those of the next step, because repetitions distort the speed."""
     return numbers[np.append(np.diff(numbers, axis=0).any(axis=1), True)] if len(numbers) else numbers
 
@@ -232,17 +234,19 @@ def _find_jumps(numbers: Float[np.ndarray, "steps 3"]) -> Bool[np.ndarray, " cha
     return np.asarray(change > max(_JUMP, _JUMP_RATIO * float(np.median(change))))
 
 
-def _step_angles(numbers: Float[np.ndarray, "steps 3"], written_as: RotationFormat) -> Float[np.ndarray, " changes"]:
-    rotations = convert_rotations(numbers, written_as)
+def _compute_step_angles(
+    numbers: Float[np.ndarray, "steps 3"], rotation_format: RotationFormat
+) -> Float[np.ndarray, " changes"]:
+    rotations = convert_rotations(numbers, rotation_format)
     return np.asarray((rotations[1:] * rotations[:-1].inv()).magnitude())
 
 
-def _relative_to_neighbours(
+def _compare_with_neighbours(
     angles: Float[np.ndarray, " changes"], is_jump: Bool[np.ndarray, " changes"]
 ) -> Float[np.ndarray, " jumps"]:
-    """Return the angle at each jump relative to the mean angle of the steps around it without jumps, or NaN."""
-    calm = np.stack([np.where(is_jump, 0.0, angles), ~is_jump])
-    sums = np.cumsum(np.pad(calm, ((0, 0), (_STEPS_AROUND + 1, _STEPS_AROUND))), axis=1)
+    """Return the angle at each jump relative to the mean angle of nearby steps without a jump; NaN if all jump."""
+    angles_and_counts = np.stack([np.where(is_jump, 0.0, angles), ~is_jump])
+    sums = np.cumsum(np.pad(angles_and_counts, ((0, 0), (_STEPS_AROUND + 1, _STEPS_AROUND))), axis=1)
     total, count = (sums[:, 2 * _STEPS_AROUND + 1 :] - sums[:, : -2 * _STEPS_AROUND - 1])[:, is_jump]
     mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     return np.asarray(angles[is_jump] / np.maximum(mean, _MIN_ANGLE_RAD))

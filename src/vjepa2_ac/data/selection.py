@@ -18,14 +18,15 @@ from vjepa2_ac.errors import InputError, counted
 
 logger = logging.getLogger(__name__)
 
-MAX_NAMED = 10  # most identities in one message
+MAX_NAMED = 10  # largest number of identities in one message
 _ALLOWED_BROKEN = 3  # broken episodes that are tolerated in all but the smallest data sets
-_ALLOWED_SHARE = 0.01  # share of broken episodes that is tolerated in large data sets
+_ALLOWED_SHARE = 0.01  # fraction of broken episodes that is tolerated in large data sets
 SPLIT_LABEL = "split"  # label of an episode: the name of its split in the data set
 
 _HELD_OUT: tuple[Split, ...] = ("validation", "test")
+# How a split of a data set is used, by its name in lower case.
 _ROLES: dict[str, Split] = {"val": "validation", "valid": "validation", "validation": "validation", "test": "test"}
-_MIN_GROUPS = 3  # one per split
+_MIN_GROUPS = 3  # one per split; with fewer groups no episode is moved into an empty split
 
 Members = Bool[np.ndarray, " episodes"]
 
@@ -93,8 +94,8 @@ def require_distinct(table: EpisodeTable, is_selected: Bool[np.ndarray, " episod
 def max_broken(episodes: int) -> int:
     """Return the number of broken episodes that `data.broken_episodes: skip` tolerates.
 
-    The limit is 3 episodes or 1 %, whichever is larger, and at most half of fewer than 6 episodes. If most episodes
-    cannot be read, probably a setting is wrong rather than the recordings.
+    The limit is 3 episodes or 1 %, whichever is larger. With fewer than 6 episodes the limit is half of them, because a
+    setting is probably wrong if most episodes cannot be read.
     """
     return max(min(_ALLOWED_BROKEN, episodes // 2), int(_ALLOWED_SHARE * episodes))
 
@@ -102,13 +103,13 @@ def max_broken(episodes: int) -> int:
 class BrokenEpisodes:
     """The broken episodes of an open data set, found while opening it or while reading clips.
 
-    The record is in the process that opened the data set; loader workers report to it. `data.broken_episodes` is the
-    policy: raise the first error, or skip and count broken episodes, and raise an error if too many are broken.
+    The list is in the process that opened the data set; loader workers report to this process. According to
+    `data.broken_episodes` the first error is raised, or broken episodes are skipped until there are too many.
 
     Args:
         config: The data.
         episodes: Number of episodes, including broken ones.
-        usable: The identity hashes of the episodes that clips may come from; None: unknown.
+        usable: The identity hashes of the episodes that are used for clips; None: unknown.
     """
 
     def __init__(self, config: DataConfig, episodes: int, usable: UInt64[np.ndarray, " usable"] | None = None) -> None:
@@ -138,10 +139,10 @@ class BrokenEpisodes:
         self._add({problem.name: str(problem.error) for problem in problems})
 
     def record(self, name: str, reason: str) -> None:
-        """Record an episode of which a clip could not be read.
+        """Record that a clip of an episode could not be read.
 
         Raises:
-            InputError: Too many episodes are broken now.
+            InputError: Too many episodes are broken.
         """
         if name not in self.reasons:
             count = len(self) + 1
@@ -170,8 +171,8 @@ class BrokenEpisodes:
         hashes = np.array([hash_identity(name) for name in names], np.uint64)
         if self._usable is not None and np.isin(self._usable, hashes).all():  # no episode would remain
             return error
-        is_few = len(names) <= max_broken(self._episodes)
-        return add_exclusion_fix(error, names, is_skippable=is_few and self._config.broken_episodes == "error")
+        is_skippable = len(names) <= max_broken(self._episodes) and self._config.broken_episodes == "error"
+        return add_exclusion_fix(error, names, is_skippable=is_skippable)
 
     def _add(self, reasons: Mapping[str, str]) -> None:
         new_reasons = {name: reason for name, reason in reasons.items() if name not in self.reasons}
@@ -195,9 +196,9 @@ def add_exclusion_fix(error: InputError, names: Sequence[str], *, is_skippable: 
     """
     fix = f"{error.fix.rstrip('.')}. " if error.fix else ""
     listing = json.dumps(names[:MAX_NAMED], ensure_ascii=False)
-    of_all = f" (the first {MAX_NAMED} of {len(names)})" if len(names) > MAX_NAMED else ""
+    excerpt = f" (the first {MAX_NAMED} of {len(names)})" if len(names) > MAX_NAMED else ""
     skip = "set data.broken_episodes: skip, or " if is_skippable else ""
-    fix = f"{fix}To leave {'it' if len(names) == 1 else 'them'} out, {skip}add{of_all} to data.exclude: {listing}"
+    fix = f"{fix}To leave {'it' if len(names) == 1 else 'them'} out, {skip}add{excerpt} to data.exclude: {listing}"
     return InputError(where=error.where, found=error.found, needed=error.needed, fix=fix)
 
 
@@ -211,7 +212,7 @@ def format_identities(ids: Sequence[str], count: int | None = None) -> str:
 
 
 def map_split_roles(names: Iterable[str]) -> dict[str, Split]:
-    """Return the split (train, validation or test) as which each split of a data set is used, by its name.
+    """Map the name of each split of a data set to its use in this package: train, validation or test.
 
     An unknown name counts as train. The result is empty unless the data set has both a training split and a held-out
     split.
@@ -232,12 +233,15 @@ def held_out_splits(table: EpisodeTable, config: DataConfig) -> dict[Split, Memb
     if labels is None or config.splits == "hash":
         return {}
     roles = map_split_roles(labels.names)
-    numbers = {split: [n for n, name in enumerate(labels.names) if roles.get(name) == split] for split in _HELD_OUT}
-    return {split: np.isin(labels.number, of_split) for split, of_split in numbers.items() if of_split}
+    masks = {
+        split: np.isin(labels.number, [index for index, name in enumerate(labels.names) if roles.get(name) == split])
+        for split in _HELD_OUT
+    }
+    return {split: mask for split, mask in masks.items() if split in roles.values()}
 
 
 def describe_splits(table: EpisodeTable, config: DataConfig) -> str:
-    """Describe how the data set's own splits are used; empty if the data set has only one split."""
+    """Describe how the data set's own splits are used; return an empty text if it has only one split."""
     labels = table.labels.get(SPLIT_LABEL)
     if labels is None:
         return ""
@@ -294,13 +298,13 @@ def draw_split(
     """
     number = split_hash.astype(np.float64) / 2**64
     among = np.ones(len(number), bool) if among is None else among
-    test, held_out = _bounds(np.unique(number[among]), config)
+    test, held_out = _compute_bounds(np.unique(number[among]), config)
     low, high = {"test": (0.0, test), "validation": (test, held_out), "train": (held_out, 2.0)}[split]
     return np.asarray(among & (number >= low) & (number < high))
 
 
-def _bounds(groups: Float[np.ndarray, " groups"], config: DataConfig) -> tuple[float, float]:
-    """Return the bounds (test, held out): groups below the first are test, groups between them are validation.
+def _compute_bounds(groups: Float[np.ndarray, " groups"], config: DataConfig) -> tuple[float, float]:
+    """Return two bounds: groups below the first bound are test, and groups between the bounds are validation.
 
     `groups` holds the numbers of all groups, sorted.
     """
@@ -327,12 +331,13 @@ def hash_groups(
         config: `data.split_by`.
 
     Raises:
-        InputError: There is no such field, a used episode has no value, or the pattern does not match its identity.
+        InputError: There is no such field, a used episode has no value of the field, or the pattern does not match the
+            identity of a used episode.
     """
     split_by = config.split_by
     if split_by is None:
         return None
-    groups = _groups(table, split_by)
+    groups = _get_groups(table, split_by)
     ungrouped = [table.identity(index) for index in np.flatnonzero(is_selected).tolist() if not groups[index]]
     if ungrouped:
         from_source = split_by in table.labels
@@ -348,7 +353,7 @@ def hash_groups(
     return np.array([hashes[group] if group else any_hash for group in groups], np.uint64)
 
 
-def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
+def _get_groups(table: EpisodeTable, split_by: str) -> list[str | None]:
     if labels := table.labels.get(split_by):
         return [labels.name_at(index) for index in range(len(table))]
     identities = [table.identity(index) for index in range(len(table))]

@@ -49,7 +49,8 @@ class CropBox:
 def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
     """Return the part of a frame that the model receives: a central crop limited to an aspect (width over height).
 
-    released: an aspect between 0.75 and 1.35. square: 1, as in Meta's evaluation. letterbox: the whole frame.
+    The limits are 0.75 and 1.35 for `released`, and 1 for `square`, as in Meta's evaluation. `letterbox` is the whole
+    frame.
     """
     aspects = {"released": (NARROWEST, WIDEST), "square": (1.0, 1.0), "letterbox": (0.0, float("inf"))}
     narrowest, widest = aspects[kind]
@@ -72,7 +73,7 @@ def crop_frames(
         InputError: The frames are too large after adding bars.
     """
     if kind == "letterbox":
-        return _with_bars(frames)
+        return _add_bars(frames)
     box = crop_box(frames.shape[1], frames.shape[2], kind)
     return frames[:, box.top : box.top + box.height, box.left : box.left + box.width]
 
@@ -87,12 +88,12 @@ def split_views(
     """
     time, height, width = frames.shape[:3]
     if width % views:
-        needed = f"a width that {views} views share, side by side"
+        needed = f"a multiple of {views}, for {views} views side by side"
         raise InputError(where="planning.views", found=f"an image {width} pixels wide", needed=needed)
     return frames.reshape(time, height, views, -1, 3).swapaxes(1, 2).reshape(time * views, height, -1, 3)
 
 
-def _with_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "time side side 3"]:
+def _add_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "time side side 3"]:
     height, width = frames.shape[1:3]
     if height == width:
         return frames
@@ -142,7 +143,7 @@ class ClipTransforms:
 
     @classmethod
     def from_config(cls, data: DataConfig, seed: int) -> ClipTransforms:
-        """Create the transforms of a config, once, in the process that starts the workers."""
+        """Create the transforms of a config; called once, in the process that starts the workers."""
         transforms = ((config.name, TRANSFORMS.create(config.name, config.options)) for config in data.transforms)
         return cls(tuple(transforms), seed)
 
@@ -177,6 +178,6 @@ def _describe_array(clip: object, part: str) -> str:
 
 @lru_cache(maxsize=32)
 def channel_constants(values: tuple[float, float, float], device: torch.device) -> Float[Tensor, "3 1 1"]:
-    """Return numbers for red, green and blue as a tensor on a device, cached because the copy blocks the host."""
+    """Return numbers for red, green and blue as a tensor on a device, cached because copying them blocks the host."""
     with torch.inference_mode(False):  # inference tensors cannot be used in training
         return torch.tensor(values, device=device).view(3, 1, 1)

@@ -1,7 +1,7 @@
 """Clip windows: the set of all clips, and their order.
 
-All results are pure functions of the episodes' identities and remaining steps, the seed and a position. They do not
-depend on the number of shards, workers or ranks, so resuming a run needs no saved state.
+All results are pure functions of the episodes' identities and selected steps, the seed and a position. They do not
+depend on the number of shards, workers or ranks, so a run can be resumed without a saved state of the loader.
 """
 
 from __future__ import annotations
@@ -24,9 +24,7 @@ from vjepa2_ac.errors import InputError, counted
 logger = logging.getLogger(__name__)
 
 _ROUNDS = 8  # rounds of the Feistel network
-_HALF_BITS = (
-    3  # smallest number of bits of a half; with fewer bits some orders of few windows are more likely than others
-)
+_MIN_HALF_BITS = 3  # bits in half of an index; with fewer bits not all orders of few windows are equally likely
 _MASK64 = (1 << 64) - 1
 
 
@@ -77,12 +75,12 @@ def find_clip_windows(table: EpisodeTable, selected_steps: StepSelection, config
 
     With `data.start_every` = n, clips start at every n-th step, counted from the first selected step of their episode.
     """
-    span = selected_steps.end - selected_steps.start - (config.clip_steps - 1)
-    phase = np.zeros(len(table), np.int32)
+    num_starts = selected_steps.end - selected_steps.start - (config.clip_steps - 1)  # for `data.start_every` = 1
+    first_steps = np.zeros(len(table), np.int32)  # first selected step of each episode
     # In reverse order, so that the first range of an episode is written last.
-    phase[selected_steps.episode[::-1]] = selected_steps.start[::-1]
-    skipped = (phase[selected_steps.episode] - selected_steps.start) % config.start_every
-    count = -((skipped - span) // config.start_every)  # rounded up; 0 or less if no clip fits
+    first_steps[selected_steps.episode[::-1]] = selected_steps.start[::-1]
+    skipped = (first_steps[selected_steps.episode] - selected_steps.start) % config.start_every
+    count = -((skipped - num_starts) // config.start_every)  # rounded up; 0 or less if no clip fits
     runs = Windows(selected_steps.episode, selected_steps.start + skipped, count, config.start_every).select(count > 0)
     return runs.select(np.lexsort((runs.first, table.id_rank[runs.episode])))
 
@@ -95,7 +93,7 @@ def select_split_windows(
     Args:
         table: The episodes.
         members: Mask of the episodes that are used and belong to the split; at least one.
-        starts: The result of `find_clip_windows`, which includes these episodes.
+        starts: The windows of these and other episodes, from `find_clip_windows`.
         config: The length of a clip.
         split: The name of the split.
 
@@ -114,8 +112,8 @@ def select_split_windows(
         problem += f" Too short: {format_identities(names, len(short))}"
         raise InputError(where=where, found=problem, needed=length, fix="Lower data.frames or data.stride")
     if len(short):
-        clip = f"a clip of {config.clip_steps} control steps and are skipped: {format_identities(names, len(short))}"
-        _warn_once(f"{config.path}: {len(short)} of {count} {split} episodes are shorter than {clip}")
+        text = f"{config.path}: {len(short)} of {count} {split} episodes are shorter than a clip of {config.clip_steps}"
+        _warn_once(f"{text} control steps and are skipped: {format_identities(names, len(short))}")
     windows = starts.select(members[starts.episode])
     if not len(windows):
         problem = f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})"
@@ -141,19 +139,19 @@ class ClipOrder:
         epoch, index = divmod(position, len(self.windows))
         return self.windows[permute_index(index, size=len(self.windows), seed=self.seed, epoch=epoch)]
 
-    def choice(self, position: int, count: int) -> int:
+    def draw_index(self, position: int, count: int) -> int:
         """Draw an index from `range(count)` uniformly for the clip at a position of the run."""
         digest = hashlib.blake2b(f"{self.seed} {position}".encode(), digest_size=8).digest()
         return int.from_bytes(digest, "big") % count
 
 
 def permute_index(index: int, *, size: int, seed: int, epoch: int) -> int:
-    """Return the image of an index under a keyed permutation of `range(size)`, computed without storing it.
+    """Return the index to which a pseudo-random permutation of `range(size)` maps an index.
 
-    A Feistel network permutes the range up to the next power of four; results outside `range(size)` are permuted again
-    until they are inside.
+    Each seed and epoch has another permutation, which is computed without storing it: a Feistel network permutes the
+    range up to the next power of four, and results outside `range(size)` are permuted again until they are inside.
     """
-    half = max(_HALF_BITS, ((size - 1).bit_length() + 1) // 2)
+    half = max(_MIN_HALF_BITS, ((size - 1).bit_length() + 1) // 2)
     keys = _round_keys(size, seed, epoch)
     index = _feistel(index, half, keys)
     while index >= size:
@@ -170,7 +168,7 @@ def _feistel(value: int, half: int, keys: tuple[int, ...]) -> int:
 
 
 def _mix(value: int) -> int:
-    """Scatter 64 bits. Source: Steele, Lea, Flood (2014), SplitMix64 (constants of Stafford's variant 13)."""
+    """Hash a 64-bit integer. Source: Steele, Lea, Flood (2014), SplitMix64 (constants of Stafford's variant 13)."""
     value = (value ^ value >> 30) * 0xBF58476D1CE4E5B9 & _MASK64
     value = (value ^ value >> 27) * 0x94D049BB133111EB & _MASK64
     return value ^ value >> 31
@@ -195,7 +193,7 @@ def candidate_strides(control_rate_hz: float) -> tuple[int, ...]:
 def require_stride(
     config: DataConfig, *, to: str, fix: str = "Run `vjepa2-ac data calibrate CONFIG` to choose one"
 ) -> int:
-    """Return the stride of a config, which must not be auto.
+    """Return the stride of a config, or refuse a config whose stride is auto.
 
     Args:
         config: The data.

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.idle import idle_by_motion, long_idle_runs
+from vjepa2_ac.data.idle import find_idle_by_motion, find_long_idle
 from vjepa2_ac.data.windows import candidate_strides
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
@@ -181,7 +181,7 @@ def _percentiles(values: Float[np.ndarray, " pairs"]) -> list[float]:
 
 def idle_runs(states: Float[np.ndarray, "steps 7"], config: DataConfig) -> Bool[np.ndarray, " steps"]:
     """Return which steps are in idle ranges, by measured motion, that are long enough for the idle filter."""
-    return long_idle_runs(idle_by_motion(states, config.idle), config.idle)
+    return find_long_idle(find_idle_by_motion(states, config.idle), config.idle)
 
 
 def largest_change(

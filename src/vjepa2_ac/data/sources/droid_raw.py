@@ -18,7 +18,7 @@ from jaxtyping import Float, Shaped, UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.sources import RAW_CAMERAS, RAW_RATE_HZ
-from vjepa2_ac.data.files import CONNECTIONS, DEEPEST, list_folder, map_in_threads
+from vjepa2_ac.data.files import CONNECTIONS, MAX_DEPTH, list_folder, map_in_threads
 from vjepa2_ac.data.index import EpisodeTable, get_or_build_index, hash_key, index_key, summarize_states
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, IndexEntry, make_frame_reader, require_indexed_length
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
@@ -48,9 +48,9 @@ Arrays = Mapping[str, Shaped[np.ndarray, "steps *numbers"]]  # pose, gripper, ..
 
 @dataclass(frozen=True)
 class _EpisodeLocation:
-    """Location of an episode, and facts from its metadata and videos."""
+    """The location of an episode, with facts from the metadata and the videos."""
 
-    folder: str
+    folder: str  # relative to the data set's folder
     version: str
     serials: dict[str, str]  # serial number of each camera in the metadata
     frames: dict[str, int]  # number of frames in the MP4 of each of the config's cameras, by serial number
@@ -59,12 +59,12 @@ class _EpisodeLocation:
 class RawDroidSource(IndexedSource[RawDroidData, None]):
     """The episodes of a raw DROID tree, or of a part of it, in the order of their paths.
 
-    `infos` reads every trajectory and the headers of the MP4s of the config's cameras, once; data behind a URL is not
+    `infos` reads every trajectory and the headers of the MP4s of the config's cameras once. Data behind a URL is not
     checked again until folders are added or removed. An episode's identity is LAB/outcome/DATE/TIME
     (`get_identity`). The numbers of a trajectory and the times of a video's frames are stored in the disk cache, so
     that each machine parses the HDF5 file and reads the packets of a video with B-frames only once.
 
-    An MP4 holds one frame per control step, in order, whatever rate its header states; the last frame may be missing.
+    An MP4 has one frame per control step, in order, regardless of the rate in its header. Only the last may be missing.
     """
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - a video is fetched in blocks
@@ -137,8 +137,8 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         metadata = parse_json_object(
             self._files.read(path, version=version), where=path, needed="the metadata of an episode"
         )
-        parsed = {camera: _parse_serial(metadata, camera) for camera in RAW_CAMERAS}
-        serial_by_camera = {camera: serial for camera, serial in parsed.items() if serial}
+        all_serials = {camera: _parse_serial(metadata, camera) for camera in RAW_CAMERAS}
+        serial_by_camera = {camera: serial for camera, serial in all_serials.items() if serial}
         serials = tuple(_select_serial(serial_by_camera, camera, path) for camera in self._config.cameras)
         counts = {}
         for serial in serials:
@@ -164,7 +164,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         )
 
     def _read_arrays(self, location: _EpisodeLocation, serials: tuple[str, ...]) -> Arrays:
-        """Return the arrays of the used steps, with the poses of some cameras and the index of each frame.
+        """Return the arrays of the steps in which the operator was in control, and the frame index of each step.
 
         Raises:
             InputError: The trajectory is damaged, incomplete, implausible, or of another length than an MP4.
@@ -184,10 +184,10 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
             raise InputError(
                 where=path, found="the camera poses are missing", needed=needed, fix="Set data.pose_frame: base"
             )
-        used = np.arange(min(steps, *location.frames.values()))
+        used_steps = np.arange(min(steps, *location.frames.values()))
         if "skipped" in arrays:
-            used = used[arrays["skipped"][used, 0] == 0]
-        numbers = {name: values[used] for name, values in arrays.items()} | {"frame": used}
+            used_steps = used_steps[arrays["skipped"][used_steps, 0] == 0]
+        numbers = {name: values[used_steps] for name, values in arrays.items()} | {"frame": used_steps}
         POSE.require_plausible(_join_states(numbers), path, fix=_FIX)
         return numbers
 
@@ -307,11 +307,11 @@ def find_episodes(root: str, connections: int) -> list[str]:
         return [""]
     episodes: list[str] = []
     folders = [""]
-    for _ in range(DEEPEST):
-        children = map_in_threads(lambda folder: _list_children(root, folder), folders, connections)
-        flat = [child for group in children for child in group]
-        episodes += [path for path, is_episode in flat if is_episode]
-        folders = [path for path, is_episode in flat if not is_episode]
+    for _ in range(MAX_DEPTH):
+        listings = map_in_threads(lambda folder: _list_children(root, folder), folders, connections)
+        children = [child for listing in listings for child in listing]
+        episodes += [path for path, is_episode in children if is_episode]
+        folders = [path for path, is_episode in children if not is_episode]
     return sorted(episodes)
 
 
@@ -329,7 +329,7 @@ def list_episode(root: str, folder: str) -> EpisodeFolder:
 def get_identity(root: str, folder: str) -> str:
     """Return the identity of an episode: LAB/outcome/DATE/TIME if its full path has this form, else its relative path.
 
-    The identity in this form is the same for any `root` in the tree.
+    LAB/outcome/DATE/TIME does not depend on which folder of the tree is `root`.
     """
     base = root.split("://", 1)[1] if storage.is_url(root) else str(Path(root).resolve())
     parts = [part for part in f"{base}/{folder}".split("/") if part]
@@ -345,7 +345,7 @@ def parse_outcome(identity: str) -> bool | None:
 def _list_children(root: str, folder: str) -> list[tuple[str, bool]]:
     """Return (path, whether it is an episode) of the folders in a folder.
 
-    In DROID's layout the depth of a path identifies episodes, so they need not be listed.
+    In DROID's layout the depth of a path identifies episodes, so that their folders need not be listed.
     """
     children = [storage.join(folder, name) for name in list_folder(root, folder)[1]]
     return [(path, parse_outcome(get_identity(root, path)) is not None or _is_episode(root, path)) for path in children]

@@ -64,8 +64,8 @@ def build_table(
 ) -> EpisodeTable:
     """Build the table of all episodes from the results of a scan.
 
-    If several episodes have the same identity, the first is used. Episodes whose kind differs from the most frequent
-    one are problems, like those with a duplicate identity.
+    If several episodes have the same identity, only the first is usable. Episodes whose kind differs from the most
+    frequent kind are not usable.
 
     Args:
         results: The result of each episode, in the source's order.
@@ -74,7 +74,7 @@ def build_table(
         progress: Called with (done, total) after each episode.
 
     Raises:
-        InputError: No episode can be used; raises the error of the first one.
+        InputError: No episode can be used; this is the error of the first episode.
     """
     usable: dict[str, IndexEntry] = {}
     problems: list[EpisodeProblem] = []
@@ -118,9 +118,9 @@ State = TypeVar("State")
 
 
 class IndexedSource(ABC, Generic[Config, State]):
-    """A source that opens its data set on the first call; its pickle for loader workers includes the index.
+    """A source that opens its data set when it is first used. A pickle for loader workers includes the index.
 
-    Any number of threads may use a source. It holds the index and the state that `_open_data_set` returns.
+    Any number of threads may use a source. A source keeps the index and the state that `_open_data_set` returns.
     """
 
     def __init__(self, config: Config) -> None:
@@ -133,7 +133,7 @@ class IndexedSource(ABC, Generic[Config, State]):
         return type(self), (self._config,), {"_index_and_state": self._index_and_state}
 
     def infos(self, progress: Progress | None = None) -> EpisodeTable:
-        """Return identity, length and outcome of every usable episode, and the problems of the others.
+        """Return identity, length and outcome of every usable episode, and the problems of unusable episodes.
 
         Raises:
             InputError: There is no data set, it does not match the config, or no episode can be used.
@@ -168,7 +168,7 @@ class IndexedSource(ABC, Generic[Config, State]):
             progress: Called with (done, total) after each episode.
 
         Raises:
-            InputError: No episode can be used; raises the error of the first one.
+            InputError: No episode can be used; this is the error of the first episode.
             OSError: Data behind a URL cannot be read.
         """
 

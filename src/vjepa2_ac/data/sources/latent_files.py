@@ -4,14 +4,14 @@ cache.json     the full key of the cache
 episodes.npz   all episodes of the encoded data set, in its order, as `EpisodeTable.to_bytes` writes them
 kept.npz       the steps that `data.idle` keeps, as `StepSelection.to_bytes` writes them; absent without an idle rule
 episodes/000/000123-CAMERA.safetensors   the latents of an episode, by its index, and a camera
-episodes/000/000123-CAMERA.broken        in its place, the reason why the episode cannot be read (see
+episodes/000/000123-CAMERA.broken        instead of latents, the reason why the episode cannot be read (see
                                          `data.broken_episodes`)
 
 All files are written atomically, also behind a URL. A cache is finished when each episode that clips need has a file
-for each camera. The tensors of such a file (control steps as in `episode`; `frames` are the encoded steps):
+for each camera. A file of latents has these tensors (`steps`: control steps of the episode; `frames`: encoded steps):
 
 latents        [frames, tokens, dim] bfloat16, float32 or int8
-scales         [frames, tokens] float32, with int8 only: a latent is its value times the scale of its token
+scales         [frames, tokens] float32, with int8 only: latent = value * scale of the token
 frame_steps    [frames] int32: the control step of each frame, ascending
 states         [steps, state_dim], and if the source has them commands, extrinsics, joint_velocities
 pictures       the encoder's input images: [bytes] uint8, concatenated JPEGs for display; or [frames, size, size, 3]
@@ -55,7 +55,7 @@ Ranges = Sequence[tuple[int, int]]  # (start, length) in bytes
 _MAX_INT8 = 127  # largest quantised value
 _JPEG_QUALITY = 85
 _HEAD_BYTES = 32 << 10  # bytes read when a file is opened: the header and most small tensors
-_LENGTH_BYTES = 8  # length of the number before the header that states the header's length
+_LENGTH_BYTES = 8  # size of the number that precedes the header and states the header's length
 _TENSOR_TYPES = {
     "BF16": torch.bfloat16, "F16": torch.float16, "F32": torch.float32, "F64": torch.float64, "BOOL": torch.bool,
     "U8": torch.uint8, "I8": torch.int8, "I16": torch.int16, "I32": torch.int32, "I64": torch.int64,
@@ -96,8 +96,8 @@ class EncodedEpisode:
 
     episode: Episode  # provides states and other data of clips; its frames are not read
     camera: str
-    steps: Sequence[int]  # control steps of the frames, ascending; there may be none
-    latents: StoredLatents  # of these frames, see `pack_latents`
+    steps: Sequence[int]  # control steps of the frames, ascending; may be empty
+    latents: StoredLatents  # latents of these frames, from `pack_latents`
     images: UInt8[np.ndarray, "frames size size 3"]  # the encoder's input images of these frames
 
 
@@ -141,9 +141,9 @@ class LatentFiles:
         Raises:
             UnreachableError: The folder cannot be listed now.
         """
-        sizes = self._sizes()
-        done = {name.rpartition(".")[0] for name, size in sizes.items() if size > 0 or name.endswith(_BROKEN_SUFFIX)}
-        return [number for number in numbers if any(_file_name(number, camera, "") not in done for camera in cameras)]
+        sizes = self._list_sizes()
+        stems = {name.rpartition(".")[0] for name, size in sizes.items() if size > 0 or name.endswith(_BROKEN_SUFFIX)}
+        return [number for number in numbers if any(_file_name(number, camera, "") not in stems for camera in cameras)]
 
     def is_done(self, number: int, camera: str) -> bool:
         """Return whether a file of latents or a `.broken` file exists; behind a URL only the listing is checked."""
@@ -160,9 +160,9 @@ class LatentFiles:
             UnreachableError: The file cannot be read now.
         """
         path, file = self.path(number, camera), self._find_file(_file_name(number, camera))
-        note = _file_name(number, camera, _BROKEN_SUFFIX)
-        if file is None and self._find_file(note) is not None:
-            reason = self._read_reason(note).rstrip(".")
+        broken_file = _file_name(number, camera, _BROKEN_SUFFIX)
+        if file is None and self._find_file(broken_file) is not None:
+            reason = self._read_reason(broken_file).rstrip(".")
             raise InputError(where=path, found=f"no latents, because encoding could not read the episode ({reason})")
         if file is None:
             raise InputError(where=path, found="no such file", needed="latents of an episode", fix=FIX)
@@ -199,8 +199,8 @@ class LatentFiles:
         metadata = json.dumps(dict(episode.metadata), sort_keys=True)
         header = {"id": episode.info.id, "camera": encoded.camera, "metadata": metadata, "key": self.key}
         storage.write(self.path(number, camera), save(tensors, metadata=header))
-        if self._find_file(note := _file_name(number, camera, _BROKEN_SUFFIX)) is not None:
-            storage.remove(storage.join(self.folder, note))
+        if self._find_file(broken_file := _file_name(number, camera, _BROKEN_SUFFIX)) is not None:
+            storage.remove(storage.join(self.folder, broken_file))
 
     def record_broken(self, number: int, camera: str, reason: str) -> None:
         """Record that an episode cannot be read, for other processes and for readers of the cache."""
@@ -208,32 +208,32 @@ class LatentFiles:
 
     @property
     def broken_reasons(self) -> dict[int, str]:
-        """The reasons of the episodes that could not be read, by the index of the episode."""
-        sizes = self._sizes()
-        notes = sorted(name for name in sizes if name.endswith(_BROKEN_SUFFIX))
-        # A note next to latents is outdated: the episode was encoded later.
-        broken = [note for note in notes if note.removesuffix(_BROKEN_SUFFIX) + _LATENTS_SUFFIX not in sizes]
-        return {int(note.rpartition("/")[2].partition("-")[0]): self._read_reason(note) for note in broken}
+        """The reason why each broken episode could not be read, by the index of the episode."""
+        sizes = self._list_sizes()
+        names = sorted(name for name in sizes if name.endswith(_BROKEN_SUFFIX))
+        # A `.broken` file next to latents is outdated, because the episode was encoded later.
+        broken = [name for name in names if name.removesuffix(_BROKEN_SUFFIX) + _LATENTS_SUFFIX not in sizes]
+        return {int(name.rpartition("/")[2].partition("-")[0]): self._read_reason(name) for name in broken}
 
-    def _sizes(self) -> Mapping[str, int]:
-        """Return the size in bytes of every file by its name in the folder; a local folder is listed again."""
+    def _list_sizes(self) -> Mapping[str, int]:
+        """Return the size of every file in bytes, by its path in the folder; a local folder is listed on every call."""
         if storage.is_url(self.folder):
-            return {name: file.size for name, file in self._listed.items()}
+            return {name: file.size for name, file in self._remote_files.items()}
         return storage.file_sizes(str(self.folder))
 
     @cached_property
-    def _listed(self) -> Mapping[str, storage.FileInfo]:
+    def _remote_files(self) -> Mapping[str, storage.FileInfo]:
         return storage.list_files_below(str(self.folder))
 
     def _find_file(self, name: str) -> storage.FileInfo | None:
         if storage.is_url(self.folder):
-            return self._listed.get(name)
+            return self._remote_files.get(name)
         with suppress(FileNotFoundError, NotADirectoryError):
             return storage.FileInfo(name, Path(self.folder, name).stat().st_size, "")
         return None
 
-    def _read_reason(self, note: str) -> str:
-        return storage.read_bytes(storage.join(self.folder, note)).decode(errors="replace")
+    def _read_reason(self, name: str) -> str:
+        return storage.read_bytes(storage.join(self.folder, name)).decode(errors="replace")
 
 
 def _file_name(number: int, camera: str, ending: str = _LATENTS_SUFFIX) -> str:
@@ -241,7 +241,7 @@ def _file_name(number: int, camera: str, ending: str = _LATENTS_SUFFIX) -> str:
 
 
 class EpisodeFile:
-    """An open file of latents, whose content is read on request, latents and images frame by frame.
+    """An open file of latents. Content is read on request; only the requested latents and images are read.
 
     The safetensors format is parsed here, because the library cannot read parts of remote files.
 
@@ -249,7 +249,7 @@ class EpisodeFile:
         path: The file.
         key: Digest of the key of its cache.
         size: Size of the file in bytes.
-        read: Returns several (start, length) pieces of the file, each complete.
+        read: Returns the bytes of several ranges (start, length) of the file, all complete.
 
     Raises:
         InputError: The file is missing, damaged, or belongs to another cache.
@@ -309,7 +309,7 @@ class EpisodeFile:
         """Read the latents of frames, given by their indices.
 
         Raises:
-            InputError: There are no such latents.
+            InputError: The file does not have these frames.
         """
         names = [name for name in ("latents", "scales") if name == "latents" or name in self.names]
         with self._translate_errors():
@@ -360,7 +360,7 @@ class EpisodeFile:
 
 @dataclass(frozen=True)
 class _Tensor:
-    """A tensor of the header of a safetensors file."""
+    """The description of a tensor in the header of a safetensors file."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]
@@ -377,17 +377,17 @@ class _Tensor:
 
     @property
     def end(self) -> int:
-        """Position after the tensor in the file."""
+        """The position of the byte after the tensor in the file."""
         return self.start + prod(self.shape) * self.dtype.itemsize
 
     def get_row_range(self, start: int, stop: int) -> tuple[int, int]:
-        """Return (start, length) in the file of the rows from `start` to `stop`."""
+        """Return the range of bytes (start, length) of the rows from `start` to `stop` in the file."""
         if not 0 <= start <= stop <= self.shape[0]:
             raise IndexError(f"rows {start} to {stop} of {self.shape[0]}")
         row = prod(self.shape[1:]) * self.dtype.itemsize
         return self.start + start * row, (stop - start) * row
 
     def to_tensor(self, pieces: Sequence[bytes], shape: tuple[int, ...]) -> Tensor:
-        """Join pieces of the tensor's bytes to a tensor of a shape."""
+        """Create a tensor of a shape from pieces of this tensor's bytes."""
         data = bytearray().join(pieces)  # torch requires a writable buffer
         return torch.frombuffer(data, dtype=self.dtype).reshape(shape) if data else torch.empty(shape, dtype=self.dtype)

@@ -1,4 +1,4 @@
-"""Source of cached latents, which needs no data set, and the key of a latent cache."""
+"""Read episodes from a latent cache, without the data set, and compare the keys of latent caches."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from vjepa2_ac.errors import InputError, MissingFileError, counted
 from vjepa2_ac.spaces import make_vector_states
 from vjepa2_ac.storage.structured import read_json_object
 
-FORMAT = 2  # of the files of a cache
-CACHE_FILE, EPISODES_FILE, STEPS_FILE = "cache.json", "episodes.npz", "kept.npz"  # files, see `latent_files`
+FORMAT = 2  # version of the files of a cache
+CACHE_FILE, EPISODES_FILE, STEPS_FILE = "cache.json", "episodes.npz", "kept.npz"  # see `latent_files`
 
 _FRAME_KEYS = {"source", "camera", "pose_frame", "cache_dtype"}  # config keys that affect frames, not clips
 _NON_ENCODING_PREFIXES = ("data", "format")  # prefixes of parts that are unrelated to the encoder
@@ -38,8 +38,8 @@ _ENCODE = "Run `vjepa2-ac encode`, which resumes an unfinished cache, or copy th
 class Encoding:
     """The settings that determine a frame's latents, and the size of the latents; see `encoding.batch.get_encoding`.
 
-    The number of frames per encoder call is not included, because it changes only the order of a sum, and on some CPUs
-    nothing (tests/encoding/test_training_cache.py).
+    The number of frames per encoder call is not included, because it changes only the order of additions, on some CPUs
+    not even that (tests/encoding/test_training_cache.py).
     """
 
     parts: Mapping[str, Any]  # parts of a `CacheKey`
@@ -50,7 +50,7 @@ class Encoding:
 
 @dataclass(frozen=True)
 class CacheKey:
-    """The values that determine the content of a folder, as {name: JSON value}; config keys have their path as name."""
+    """Values that determine the content of a folder, as {name: JSON value}. The name of a config key is its path."""
 
     parts: Mapping[str, Any]
 
@@ -65,13 +65,13 @@ class CacheKey:
         return tuple(map(str, self.parts["data.camera"]))
 
     def list_differences(self, parts: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
-        """Return the differences from other parts, such as "data.stride: 8, not 4", for some names or for all."""
+        """Return how other parts differ, such as "data.stride: 8, not 4"; without `names` all parts are compared."""
         parts = json.loads(json.dumps(dict(parts)))  # converts tuples to lists, as in a file
         names = sorted(self.parts.keys() | parts) if names is None else names
         return [text for name in names for text in _compare_values(name, self.parts.get(name), parts.get(name))]
 
     def list_encoding_differences(self, encoding: Encoding) -> list[str]:
-        """Return the differences in the settings by which frames became latents."""
+        """Return the differences in the settings of the encoder and its input."""
         names = sorted(self.parts.keys() | encoding.parts)
         return self.list_differences(
             encoding.parts, [name for name in names if not name.startswith(_NON_ENCODING_PREFIXES)]
@@ -84,7 +84,7 @@ def build_cache_key(config: DataConfig, fingerprint: str, encoding: Encoding) ->
     Args:
         config: The config of the data set and its clips.
         fingerprint: The fingerprint of its episodes.
-        encoding: The settings by which frames become latents.
+        encoding: The settings of the encoder and its input.
     """
     return CacheKey({
         "format": FORMAT,
@@ -98,7 +98,7 @@ def build_cache_key(config: DataConfig, fingerprint: str, encoding: Encoding) ->
 
 
 def get_clip_parts(config: DataConfig) -> dict[str, Any]:
-    """Return the parts that determine the frames and other data of clips, to check a cache that is used by itself."""
+    """Return the parts that determine the data of clips, to check a cache that is used without its data set."""
     values = values_that_affect(Affects.LATENTS, config) | {"stride": config.model_stride}
     names = values.keys() - _FRAME_KEYS - config.format_sections().keys()
     return {f"data.{name}": values[name] for name in sorted(names)}
@@ -127,15 +127,15 @@ def require_matching_folder(folder: Path | str, name: str, key: CacheKey, *, whe
             problem = f"the folder contains other files, such as {other_names[0]}"
             raise InputError(where=where, found=problem, needed="a new or empty folder", fix=fix) from None
         return
-    if differing := CacheKey(stored.get("key") or {}).list_differences(key.parts):
-        problem = f"the folder was created with different settings: {'; '.join(differing)}"
+    if differences := CacheKey(stored.get("key") or {}).list_differences(key.parts):
+        problem = f"the folder was created with different settings: {'; '.join(differences)}"
         needed = "a new folder, or a folder that was created with these settings"
         raise InputError(where=where, found=problem, needed=needed, fix=fix)
 
 
 def _compare_values(name: str, stored: Any, current: Any) -> list[str]:
     if stored == current or (current is None and name in REMOVED and stored in REMOVED[name].values):
-        return []  # equal, or the key of a removed option whose stored value equals today's behaviour
+        return []  # equal, or a removed config key whose stored value is the present behaviour
     if isinstance(stored, dict) and isinstance(current, dict):
         keys = sorted(stored.keys() | current)
         return [text for key in keys for text in _compare_values(f"{name}.{key}", stored.get(key), current.get(key))]
@@ -151,7 +151,7 @@ def read_cache_key(folder: Path | str) -> CacheKey:
     """Read the key of a latent cache.
 
     Raises:
-        InputError: The folder has no key, or one of another format.
+        InputError: The folder has no key, or a key of another format.
     """
     where = storage.join(folder, CACHE_FILE)
     needed = f"a folder with the {CACHE_FILE} of a latent cache, format {FORMAT}"
@@ -205,14 +205,14 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The cameras that clips are drawn from: the config's, or all of the cache."""
+        """The cameras that clips are drawn from: the cameras of the config, or all cameras of the cache."""
         return self.key.cameras if self._config.camera is None else self._config.cameras
 
     def read_selected_steps(self) -> StepSelection | None:
         """Return the ranges that `data.idle` keeps, from the cache; None if the rule is none.
 
         Raises:
-            InputError: There is no cache, or its clips differ from the config's.
+            InputError: There is no cache, or it was encoded for other clips than the config's.
         """
         return self._open()[1].selected_steps
 
@@ -223,19 +223,19 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
             InputError: The file is missing or damaged, or the episode could not be read while encoding.
             UnreachableError: The file cannot be read now.
         """
-        table, opened = self._open()
+        table, cache = self._open()
         camera = camera or self.cameras[0]
-        record, info = opened.files.open(index, camera), table[index]
-        arrays = {name: record.read_array(name) for name in OPTIONAL if name in record.names}
-        arrays["states"] = record.read_array("states")
-        self._require_plausible(arrays, info, f"{record.path}: {info.id}")
+        file, info = cache.files.open(index, camera), table[index]
+        arrays = {name: file.read_array(name) for name in OPTIONAL if name in file.names}
+        arrays["states"] = file.read_array("states")
+        self._require_plausible(arrays, info, f"{file.path}: {info.id}")
         return Episode(
             info=info,
-            read_frames=lambda steps: record.read_images(record.find_frames(steps)),
+            read_frames=lambda steps: file.read_images(file.find_frames(steps)),
             control_rate_hz=float(table.texts["control_rate_hz"]),
-            metadata=record.metadata,
-            read_latents=lambda steps: record.read_latents(record.find_frames(steps)),
-            frame_steps=record.frame_steps,
+            metadata=file.metadata,
+            read_latents=lambda steps: file.read_latents(file.find_frames(steps)),
+            frame_steps=file.frame_steps,
             **arrays,
         )
 
@@ -261,9 +261,9 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
             InputError: Some of these episodes have no files: the cache is unfinished, or was made from other episodes.
             UnreachableError: The folder cannot be listed now.
         """
-        table, opened = self._open()
+        table, cache = self._open()
         numbers = np.unique(episodes).tolist()
-        if missing := opened.files.find_missing(numbers, self.cameras):
+        if missing := cache.files.find_missing(numbers, self.cameras):
             count = f"{len(missing)} of {counted(len(numbers), 'episode')}"
             problem = f"no latents of {count}, such as {table.identity(missing[0])}"
             fix = (
@@ -276,12 +276,12 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         folder = storage.parse_folder(self._config.path)
         key = read_cache_key(folder)
         parts = get_clip_parts(self._config)
-        differing = key.list_differences(parts, parts)
+        differences = key.list_differences(parts, parts)
         for camera in () if self._config.camera is None else self._config.cameras:
             if camera not in key.cameras:
-                differing.append(f"data.camera: {', '.join(key.cameras)}, not {camera}")
-        if differing:  # the clips of the cache differ from the config's
-            raise cache_mismatch_error(folder, differing)
+                differences.append(f"data.camera: {', '.join(key.cameras)}, not {camera}")
+        if differences:  # the clips of the cache differ from the config's
+            raise cache_mismatch_error(folder, differences)
         has_idle_rule = self._config.idle.rule != "none"
         selected_steps = read_table(storage.join(folder, STEPS_FILE), StepSelection) if has_idle_rule else None
         cache = open_download_cache(self._config.disk_cache) if storage.is_url(folder) else None
@@ -289,9 +289,9 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         return table, _Cache(key, LatentFiles(folder, key.digest, cache), selected_steps)
 
 
-def cache_mismatch_error(folder: Path | str, differing: Sequence[str]) -> InputError:
-    """Return the error of a cache with other settings than those in use."""
-    problem = f"the latent cache was encoded with different settings: {'; '.join(differing)}"
+def cache_mismatch_error(folder: Path | str, differences: Sequence[str]) -> InputError:
+    """Return the error of a cache that was encoded with other settings than the present ones."""
+    problem = f"the latent cache was encoded with different settings: {'; '.join(differences)}"
     needed = "a latent cache that was encoded with this model and these settings"
     fix = "Change the settings to those of the cache, or encode the data set again"
     return InputError(where=str(folder), found=problem, needed=needed, fix=fix)

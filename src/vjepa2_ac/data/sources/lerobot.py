@@ -50,7 +50,7 @@ from vjepa2_ac.storage.block_file import BlockCachedFile
 FRAME_COLUMN, TIME_COLUMN = "frame_index", "timestamp"
 
 _DATA_BYTES = "data_bytes"  # total size of the Parquet files with rows
-_CHECKS = 2  # version of the checks during indexing and of the choice of frames; a new number rebuilds all indexes
+_CHECKS = 2  # version of the checks while indexing and of the selection of frames; a new number rebuilds all indexes
 
 _FIX_VECTORS = "Exclude the episode, or check data.lerobot.state and data.lerobot.action"
 
@@ -61,10 +61,10 @@ EpisodeArrays = dict[str, Any]
 class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
     """The episodes of a LeRobot data set, v3.0 or v2.1, in the order of their numbers.
 
-    For a local data set `infos` checks the states of every episode and the headers of the videos. For a remote one it
-    reads only the files in meta, and states are checked when an episode is read; if `data.outcome` needs a value that
-    only the rows have, all states are read. `read` fetches the row groups with the episode's rows; frames are fetched
-    and decoded on request.
+    For a local data set `infos` checks the states of every episode and the headers of the videos. For a remote data set
+    `infos` reads only the files in meta, unless `data.outcome` needs a value that only the rows have. The states are then
+    checked when an episode is read. `read` fetches the row groups with the episode's rows. Frames are fetched and decoded on
+    request.
     """
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - frames are fetched one by one
@@ -177,14 +177,14 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         """Return the data in the rows of an episode, and whether the episode succeeded (None: unknown).
 
         Raises:
-            InputError: Rows or columns are missing, have another width, or are implausible states.
+            InputError: Rows or columns are missing, a column has another width, or the states are implausible.
         """
         info, config, where = self._info, self._config, self._where(row)
         rows = self._parquet.read_rows(storage.join(info.root, row.data_file(info)), row.index)
         fields = config.lerobot
         _require_rows(rows, row.length, info.fps, where)
 
-        def column(name: str) -> Float[np.ndarray, "steps width"]:
+        def get_column(name: str) -> Float[np.ndarray, "steps width"]:
             if name not in rows:
                 raise missing_error("data.lerobot", "column", name, where, rows)
             feature, width = info.features.get(name), rows[name].shape[1]
@@ -194,15 +194,15 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             return rows[name].astype(np.float64)
 
         def concatenate(names: Sequence[str]) -> Float[np.ndarray, "steps width"]:
-            numbers = np.concatenate([column(name) for name in names], axis=1)
+            numbers = np.concatenate([get_column(name) for name in names], axis=1)
             require_finite(numbers, where, fix=_FIX_VECTORS)
             return numbers
 
-        def optional(name: str | None) -> Float[np.ndarray, "steps width"] | None:
-            """Return an optional column; if the data set has it, every file must have it."""
-            return None if name is None or (name not in rows and name not in info.features) else column(name)
+        def get_optional_column(name: str | None) -> Float[np.ndarray, "steps width"] | None:
+            """Return a column, or None if the data set lacks the column. Otherwise every file must have it."""
+            return None if name is None or (name not in rows and name not in info.features) else get_column(name)
 
-        states, success = concatenate(fields.state), optional(fields.success)
+        states, success = concatenate(fields.state), get_optional_column(fields.success)
         if fields.select is not None:
             states = states[:, list(fields.select)]
         content = {
@@ -210,7 +210,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             if config.states == "pose"
             else states,
             "commands": concatenate(fields.action) if config.actions == "recorded" else None,
-            "joint_velocities": None if optional(JOINT_VELOCITY) is None else concatenate([JOINT_VELOCITY]),
+            "joint_velocities": None if get_optional_column(JOINT_VELOCITY) is None else concatenate([JOINT_VELOCITY]),
         }
         return content, None if success is None else bool(success.any())
 
@@ -256,9 +256,9 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
 def select_columns(config: LeRobotData) -> list[str]:
     """Return the names of the columns that are read if a file has them."""
     fields = config.lerobot
-    optional = [JOINT_VELOCITY, *((fields.success,) if fields.success else ())]
+    optional_columns = [JOINT_VELOCITY, *((fields.success,) if fields.success else ())]
     commands = fields.action if config.actions == "recorded" else ()
-    return [EPISODE_COLUMN, FRAME_COLUMN, TIME_COLUMN, *fields.state, *commands, *optional]
+    return [EPISODE_COLUMN, FRAME_COLUMN, TIME_COLUMN, *fields.state, *commands, *optional_columns]
 
 
 def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
@@ -278,7 +278,7 @@ def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
     if TIME_COLUMN not in rows:
         return
     errors_s = abs(rows[TIME_COLUMN][:, 0] - order / fps)
-    if not errors_s.max() < 0.5 / fps:  # written this way, because a NaN is an error, too
+    if not errors_s.max() < 0.5 / fps:  # not >=, so that NaN is refused
         step = int(np.argmax(~(errors_s < 0.5 / fps)))
         problem = f"{TIME_COLUMN} {rows[TIME_COLUMN][step, 0]:.4g} s"
         needed = f"{step / fps:.4g} s, at the {fps:g} rows per second of meta/info.json"

@@ -51,7 +51,7 @@ _ROUNDING_STEPS = 0.25  # the ranges of two episodes in a video may overlap by t
 
 @dataclass(frozen=True)
 class Feature:
-    """One column, or one camera."""
+    """A column of numbers, or a camera, as described in meta/info.json."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -60,7 +60,7 @@ class Feature:
 
     @property
     def width(self) -> int:
-        """The number of numbers per step."""
+        """How many numbers the feature has per step."""
         return math.prod(self.shape)
 
     @property
@@ -201,7 +201,7 @@ def _parse_splits(content: object) -> dict[str, range]:
 
 
 def _parse_feature(content: Mapping[str, Any]) -> Feature:
-    """Parse a feature; depth maps are recognised by the marks of any LeRobot version, or by their pixel format.
+    """Parse a feature; depth maps are recognised by the flags of any LeRobot version, or by their pixel format.
 
     Source: huggingface/lerobot @ 7427f31, src/lerobot/configs/video.py, is_depth_map.
     """
@@ -305,7 +305,7 @@ def read_episode_rows(
         tables: Paths, in the data set, of the files that list the episodes.
         videos: Video features whose locations are required.
         success: Column whose statistics contain the outcome; not available in v2.1.
-        open_file: Returns the path or file to open for a path.
+        open_file: Returns the local path or the open remote file of a path.
 
     Raises:
         InputError: The tables are missing, damaged, or do not match the count in meta/info.json.
@@ -471,7 +471,7 @@ def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[
 
 
 def get_row(table: EpisodeTable, index: int) -> EpisodeRow:
-    """Return the length and location of an episode of a table, without its task."""
+    """Return the entry of an episode from the columns of the index, without the task."""
     return EpisodeRow(
         int(table.num_steps[index]), {name: column[index].item() for name, column in table.locators.items()}
     )

@@ -61,7 +61,7 @@ _LABELS = ("scene", "building", "operator", "day")
 _LOCAL_HEADER_BYTES = 30
 _MAX_BYTES = 1 << 30  # limit for an array that is read completely
 _MAX_UNPACKED_BYTES, _MAX_RATIO = 1 << 30, 100  # above the first size, limit of the ratio of unpacked to packed bytes
-_KINDS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # as numpy writes; others may expand without limit
+_COMPRESSIONS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # other types may expand without limit
 _FIX = "Write the file again, with numpy.savez"
 
 
@@ -172,7 +172,8 @@ def open_npz(file_or_path: str | BlockCachedFile, path: str) -> Iterator[NpzFile
     """Open an .npz file, given by its path or as an open remote file, for reading.
 
     Raises:
-        InputError: The file is missing, or not an .npz file. An UnreachableError if it cannot be read.
+        InputError: The file is missing, or not an .npz file.
+        UnreachableError: The file cannot be read now.
     """
     with (
         storage.translate_read_errors(path, fix="Restore the file, or exclude the episode"),
@@ -186,7 +187,7 @@ def open_npz(file_or_path: str | BlockCachedFile, path: str) -> Iterator[NpzFile
 
 @dataclass(frozen=True)
 class ArrayHeader:
-    """Shape and type of an array, and the offset of its values in the archive's member."""
+    """Shape and type of an array, and the offset of the values in the unpacked file of the array."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
@@ -215,7 +216,7 @@ class NpzFile:
         self._file, self._where = file, where
         with self._translate_errors():
             self._archive = zipfile.ZipFile(cast("IO[bytes]", file))
-            members = [info for info in self._archive.infolist() if info.compress_type in _KINDS]
+            members = [info for info in self._archive.infolist() if info.compress_type in _COMPRESSIONS]
         self._members = {info.filename.removesuffix(".npy"): info for info in members if info.filename.endswith(".npy")}
 
     @property
@@ -273,7 +274,7 @@ class NpzFile:
         return InputError(where=f"{self._where}: {name}", found=problem, needed=needed, fix=FORMAT_HELP)
 
     def read_numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
-        """Read an array of finite numbers of a shape, in which None stands for any length."""
+        """Read an array of finite numbers. In `shape` None stands for any size."""
         self._require(name, shape, "biuf", "numbers")
         if (count := prod(self.read_header(name).shape)) > _MAX_NUMBERS:
             raise self.array_error(name, f"{count:,} numbers", f"at most {_MAX_NUMBERS:,} in an episode")
@@ -300,7 +301,7 @@ class NpzFile:
         return None
 
     def require_frames(self, camera: str, steps: int, *, count: int = 1) -> None:
-        """Refuse an array that cannot be the frames of a camera, by its header; `count` frames are read together."""
+        """Refuse an array whose header is not that of a camera's frames; `count` frames will be read together."""
         self._require(camera, (steps, None, None, 3), "u", "frames (steps, height, width, 3)")
         header = self.read_header(camera)
         require_decodable_size(header.shape[1], header.shape[2], f"{self._where}: {camera}", count=count)
@@ -330,8 +331,8 @@ class NpzFile:
         """Return the offset in the file of the content of an uncompressed member."""
         self._file.seek(member.header_offset)
         local = self._file.read(_LOCAL_HEADER_BYTES)
-        names = int.from_bytes(local[26:28], "little") + int.from_bytes(local[28:30], "little")
-        return member.header_offset + _LOCAL_HEADER_BYTES + names
+        name_bytes, extra_bytes = (int.from_bytes(local[start : start + 2], "little") for start in (26, 28))
+        return member.header_offset + _LOCAL_HEADER_BYTES + name_bytes + extra_bytes
 
     @contextmanager
     def _translate_errors(self, name: str = "") -> Iterator[None]:

@@ -1,7 +1,7 @@
 """Read the rows of one episode from a Parquet file of many episodes: only its row groups and the required columns.
 
-An untrusted file cannot exhaust the memory. Equal values compress so well that a few KB may expand to any size, so the
-numbers of values are checked in the footer, and tables of text or images are read a few rows at a time.
+An untrusted file cannot exhaust the memory. A few KB of compressed equal values may expand to any size, so the footer's
+numbers of values are checked first, and tables of text or images are read a few rows at a time.
 """
 
 from __future__ import annotations
@@ -182,11 +182,11 @@ def _open_parquet(source: str | BlockCachedFile, path: str) -> Iterator[parquet.
 def _read_episode_ranges(
     file: parquet.ParquetFile, path: str, source: str | BlockCachedFile, columns: Sequence[str]
 ) -> list[tuple[float, float]]:
-    """Return the least and the greatest episode number of each row group; infinite if the file has no statistics.
+    """Return the smallest and the largest episode number of each row group; infinite without statistics in the file.
 
     Raises:
         InputError: There is no column of episode numbers, or a column has too many numbers.
-        pyarrow.ArrowException, OSError: The footer contradicts itself.
+        pyarrow.ArrowException, OSError: The entries of the footer are inconsistent.
     """
     paths = [file.metadata.schema.column(index).path for index in range(file.metadata.num_columns)]
     indices = [index for index, path in enumerate(paths) if any(f"{path}.".startswith(f"{name}.") for name in columns)]
@@ -230,7 +230,7 @@ def _read_parts(
 ) -> Iterator[dict[str, list[Any]]]:
     """Yield some columns as Python values, a few rows at a time, up to a limit of their total size.
 
-    Sizes are counted as Python values, because the table stores equal values once, but Python a copy of each.
+    Sizes are counted as Python values, because Python stores every value, but the table stores equal values only once.
     """
     total = 0
     for part in file.iter_batches(_ROWS_AT_ONCE, columns=columns, use_threads=False, **selection):

@@ -1,9 +1,10 @@
-"""Source of RLDS episodes, one tf.train.Example each, read without TensorFlow; images are read on demand.
+"""Source of RLDS episodes. Each is one tf.train.Example, read without TensorFlow; images are read on request.
 
 For a record behind a URL, the positions of its features and images are cached on this machine without limit (about 4 KB
-per episode). Its numbers, and the images of steps that clips may come from, are cached within the limit of
+per episode). The numbers, and the images of steps that clips may come from, are cached within the limit of
 `data.disk_cache`. The first read fetches all images of the camera, because their positions are unknown until then.
-Later reads fetch exactly the images of a clip that are not cached; fixed blocks would be several times as large.
+Later reads fetch only the images of a clip that are not cached. Blocks of a fixed size would transfer several times as
+much data.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
     completely and its CRC is checked.
 
     Behind a URL only parts of a record are fetched, which have no CRC. The CRCs of the lengths, the nesting of features
-    and images, and the format of images are checked; otherwise the integrity relies on the transport.
+    and images, and the format of images are checked. Other damage is only prevented by the network protocol.
     """
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
@@ -150,7 +151,7 @@ class RemoteEpisode:
         self._key = f"{shard.path} {shard.version} {shard.size} {span.offset}"
 
     def fetch_record(self, names: Sequence[str]) -> Record:
-        """Fetch these features of the record, if it has them, and return the record.
+        """Fetch the features with these names, and return the record; missing features are ignored.
 
         Raises:
             InputError: The record cannot be read, or is not an Example.
@@ -176,7 +177,7 @@ class RemoteEpisode:
             name: The name of the feature.
             feature: The position of the feature.
             num_steps: Number of steps of the episode.
-            needed: Steps whose images are cached; None: all.
+            needed: Steps whose images are stored in the cache; None: all.
             where: File, record, identity and feature, for messages.
         """
         key = f"{self._key} {name}"
@@ -220,7 +221,7 @@ class RemoteEpisode:
         return images
 
     def _read_images(self, key: str, ranges: list[ByteRange], steps: Sequence[int]) -> dict[int, bytes]:
-        """Return images whose positions are known, from the cache or fetched, neighbouring images with one request."""
+        """Return images with known positions from the cache, or fetch them; one request fetches neighbouring images."""
         images = dict(zip(steps, self._contents.read_parts(key, len(ranges), steps) or [b""] * len(steps), strict=True))
         missing_steps = sorted(step for step, image in images.items() if not image)
         fetched = read_adjacent_ranges(self._shard.path, [ranges[step] for step in missing_steps], _GAP_BYTES)

@@ -1,8 +1,8 @@
 """Read an episode from an RLDS record, and index all records by reading their headers and skipping most of the data.
 
-While indexing, the states of local records are checked, too. Behind a URL a read takes tens of milliseconds, so many
-shards are read concurrently, and only the identity and the number of steps of a record are read; its states are checked
-when the episode is read.
+While indexing, the states of local records are also checked. Behind a URL a read takes tens of milliseconds. Therefore
+many shards are read concurrently, and only the identity and the number of steps of a record are read; the states are
+checked when the episode is read.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from vjepa2_ac.spaces import no_steps_error, require_finite
 IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
 STEP_FLAG = "steps/is_first"
 _MAX_BYTES = 1 << 28  # size limit of a feature of numbers or texts, which is read completely
-_IN_FLIGHT = 128  # concurrent reads behind a URL, which are small, and sequential within a shard
+_IN_FLIGHT = 128  # concurrent reads behind a URL, which are small; the reads of a shard are sequential
 _SAMPLES = 4  # shards whose first record is checked before a remote data set is indexed
 _NUMBERS: tuple[Kind, ...] = ("float_list", "int64_list")  # booleans are stored as integers
 _FIX_IDENTITY = "Name text or integer features in data.fields.identity, or set data.fields.identity: record"
@@ -94,7 +94,7 @@ class Record:
         """Return the position of a feature.
 
         Raises:
-            InputError: The record lacks the feature; names the existing ones.
+            InputError: The record lacks the feature. The message lists the existing features.
         """
         if name not in self.feature_ranges:
             names = sorted(self.feature_ranges)
@@ -148,7 +148,7 @@ def read_identity(record: Record, fields: RldsFields) -> str:
 
 
 def list_step_features(config: RldsData) -> tuple[str, ...]:
-    """Return the features of states and recorded actions."""
+    """Return the names of the features that form the states and the recorded actions."""
     return config.fields.state + (config.fields.action if config.actions == "recorded" else ())
 
 
@@ -156,10 +156,10 @@ def read_num_steps(record: Record, config: RldsData) -> int:
     """Return the number of steps: the length of the flag `is_first`, or of the states if they are complete poses.
 
     Raises:
-        InputError: The record has neither.
+        InputError: The record has neither of these features.
     """
     fields = config.fields
-    if config.states == "vector" or fields.select is not None:  # only the flag gives the count
+    if config.states == "vector" or fields.select is not None:  # the length of the states is not the number of steps
         record.find_feature(STEP_FLAG)
     if STEP_FLAG in record.feature_ranges:
         return len(record.read_values(STEP_FLAG, "int64_list"))
@@ -198,7 +198,8 @@ def read_states(record: Record, config: RldsData, steps: int, where: str) -> Flo
     """Read the measured states (conventions: `vjepa2_ac.episode`) and check that they are plausible.
 
     Raises:
-        InputError: A feature is missing, does not have equally many numbers per step, or has implausible states.
+        InputError: A feature is missing, does not have the same count of numbers at each step, or has
+            implausible states.
     """
     if steps == 0:
         raise no_steps_error(where)
@@ -222,8 +223,8 @@ def read_commands(
     """Read the recorded actions if `data.actions` is recorded, otherwise return None.
 
     Raises:
-        InputError: A feature is missing, does not have equally many numbers per step, or has numbers that are not
-            finite.
+        InputError: A feature is missing, does not have the same count of numbers at each step, or has
+            numbers that are not finite.
     """
     if config.actions != "recorded":
         return None
@@ -246,13 +247,13 @@ def _read_per_step(record: Record, name: str, steps: int, where: str) -> Float[n
 def build_index(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str], progress: Progress) -> EpisodeTable:
     """Index all episodes of the shards.
 
-    Images are only checked for presence, behind a URL only in some episodes.
+    Only the presence of images is checked, and behind a URL only in some episodes.
 
     Args:
         shards: All shards of the data set.
         config: The names of the features and the definition of a state.
         cameras: Image features that every episode must have.
-        progress: Called with the number of scanned episodes.
+        progress: Called with (done, total) after each episode.
 
     Raises:
         InputError: A shard cannot be read, or no episode can be used.
@@ -280,7 +281,7 @@ def locate_record(table: EpisodeTable, shards: Sequence[Shard], index: int) -> t
 def _scan_shard(
     shard: Shard, shard_index: int, read: ReadBytes, config: RldsData, cameras: Sequence[str]
 ) -> Iterator[ScanResult]:
-    """Yield the result of each expected record of a shard; records behind a damaged length are problems."""
+    """Yield the result of each expected record of a shard; all records after a damaged length are problems."""
     offset = 0
     for number in range(shard.episodes):
         remaining = range(number, shard.episodes)
@@ -309,7 +310,7 @@ def _make_count_problem(shard: Shard, number: int, problem: str) -> EpisodeProbl
 def _scan_record(
     read: ReadBytes, span: RecordSpan, shard: int, name: str, config: RldsData, cameras: Sequence[str]
 ) -> ScanResult:
-    """Return the index entry or the problem of a record; a problem has the name `name` if the identity is unknown."""
+    """Return the index entry or the problem of a record; `name` is used for records without a readable identity."""
     is_remote, fields, record = storage.is_url(span.path), config.fields, Record(read, span)
     try:
         if is_remote:
@@ -337,7 +338,8 @@ def _read_checked_states(
     """Return the states of a record after checking that it has all features of an episode.
 
     Raises:
-        InputError: A feature is missing, does not have equally many numbers per step, or has implausible numbers.
+        InputError: A feature is missing, does not have the same count of numbers at each step, or has
+            implausible numbers.
     """
     for name in (*config.fields.identity_features, *list_step_features(config), *cameras):
         record.find_feature(name)

@@ -31,8 +31,8 @@ class Shard:
     path: str
     episodes: int
     size: int  # bytes
-    version: str  # as from `storage.list_files`: changes with the content
-    split: str  # the name of its split in the data set
+    version: str  # from `storage.list_files`; changes with the content
+    split: str  # name of the split in the data set
 
     @property
     def name(self) -> str:
@@ -41,16 +41,16 @@ class Shard:
 
 
 def find_shards(folder: str) -> list[Shard]:
-    """Return the non-empty shards of all splits in dataset_info.json, in its order.
+    """Return the non-empty shards of all splits, in the order of dataset_info.json.
 
     Raises:
         InputError: There is no data set, its description is invalid or unsupported, or shards are missing.
     """
     where = storage.join(folder, _INFO)
     info = _read_info(folder, where)
-    if (form := info.get("fileFormat", "tfrecord")) != "tfrecord":
+    if (file_format := info.get("fileFormat", "tfrecord")) != "tfrecord":
         raise InputError(
-            where=where, found=f"fileFormat {form}", needed="tfrecord", fix="Convert the data set with TFDS"
+            where=where, found=f"fileFormat {file_format}", needed="tfrecord", fix="Convert the data set with TFDS"
         )
     try:
         expected_shards = [shard for split in info["splits"] for shard in _list_shards(split, str(info["name"]))]
@@ -60,13 +60,13 @@ def find_shards(folder: str) -> list[Shard]:
     if not expected_shards:
         raise InputError(where=where, found="no episodes in any split", needed="a data set with episodes")
     names = [name for name, *_ in expected_shards]
-    present = {file.name: file for file in storage.list_files(folder)}
-    if missing := [name for name in names if name not in present]:
+    files = {file.name: file for file in storage.list_files(folder)}
+    if missing := [name for name in names if name not in files]:
         problem = f"{len(missing)} of {len(names)} shards are missing: {format_identities(missing)}"
         fix = f"Download them, or rename the existing files to the names in {_INFO}"
         raise InputError(where=folder, found=problem, needed=f"every shard that {_INFO} lists", fix=fix)
     return [
-        Shard(storage.join(folder, name), count, present[name].size, present[name].version, split)
+        Shard(storage.join(folder, name), count, files[name].size, files[name].version, split)
         for name, count, split in expected_shards
     ]
 
@@ -117,7 +117,7 @@ def _list_shards(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int
         }
         template = split.get("filepathTemplate") or _DEFAULT_TEMPLATE
         if count:
-            name = re.sub(r"\{(\w+)\}", lambda match, of=values: of.get(match[1], match[0]), template)
+            name = re.sub(r"\{(\w+)\}", lambda match, values=values: values.get(match[1], match[0]), template)
             yield name, count, values["SPLIT"]
 
 

@@ -3,11 +3,11 @@
 A file is a sequence of records: u64 little-endian length, masked CRC-32C of the length, data, masked CRC-32C of the
 data. The data of each record is one tf.train.Example: a map from feature names to lists of bytes, floats or integers.
 
-A DROID episode has 18 MB, nearly all of it images; its identity and length are a few hundred bytes. They, and single
-images of a feature, are found by reading tags and lengths and skipping the content. The features of a record have no
-fixed order: TFDS uses the order of a hash, which differs between the processes that wrote the files. Apart from that
-order all protobuf writers produce the same bytes, and only this form is supported: in an entry the name precedes the
-feature, and numbers are one packed list.
+A DROID episode has 18 MB, nearly all of it images. The identity and the length are a few hundred bytes. Features and
+single images are found by reading tags and lengths and skipping the content. The features of a record have no fixed
+order: TFDS uses the order of a hash, which differs between the processes that wrote the files. Apart from this order
+all protobuf writers produce the same bytes. Only this form is supported: in an entry the name precedes the feature, and
+numbers are one packed list.
 
 Source: tensorflow/tensorflow, tensorflow/core/lib/io/record_writer.h and core/example/{example,feature}.proto, and
 protobuf.dev/programming-guides/encoding (the formats; no code).
@@ -29,7 +29,7 @@ ReadBytes = Callable[[int, int], bytes]  # (offset, length) -> bytes of a file; 
 ByteRange = tuple[int, int]  # offset and length of a part of a file
 Kind = Literal["bytes_list", "float_list", "int64_list"]
 
-HEADER_BYTES = 12
+HEADER_BYTES = 12  # of a record
 _FOOTER_BYTES = 4
 _PIECE_BYTES = 1 << 18  # small enough to remain in the processor's cache between reading and checking
 _MASK_DELTA = 0xA282EAD8
@@ -37,8 +37,8 @@ _MASK_DELTA = 0xA282EAD8
 _KINDS: tuple[Kind, ...] = ("bytes_list", "float_list", "int64_list")  # fields 1, 2, 3 of tf.train.Feature
 _FIRST, _SECOND, _THIRD = 0x0A, 0x12, 0x1A  # tags of length-delimited fields 1, 2 and 3
 _VARINT_BYTES = 10  # longest varint
-_HEAD_BYTES = 1 + _VARINT_BYTES
-_ENTRY_HEAD_BYTES = 400  # the headers and the name of a feature
+_HEAD_BYTES = 1 + _VARINT_BYTES  # tag and length of a field
+_ENTRY_HEAD_BYTES = 400  # bytes that are read at the start of an entry, for the headers and the name of the feature
 
 
 @dataclass(frozen=True)
@@ -116,9 +116,9 @@ class NotAnExampleError(ValueError):
 
 
 def iterate_features(read: ReadBytes, start: int, length: int) -> Iterator[tuple[str, ByteRange]]:
-    """Yield the name and position of each feature in file order, reading only as far as the caller iterates.
+    """Yield (name, position of the serialised tf.train.Feature) of each feature, in the order of the file.
 
-    A position is the position of the serialised tf.train.Feature. No CRC is checked.
+    The file is read only as far as the caller iterates. No CRC is checked.
 
     Raises:
         NotAnExampleError: The bytes are not an Example.
@@ -188,7 +188,7 @@ def write_record(file: BinaryIO, data: bytes) -> None:
 
 
 def encode_example(features: Mapping[str, tuple[Kind, Sequence[Any] | np.ndarray]]) -> bytes:
-    """Serialise a tf.train.Example, with features sorted as protobuf does: a prefix sorts after the longer name."""
+    """Serialise a tf.train.Example. Features are sorted as by protobuf: a name precedes every prefix of the name."""
     names = sorted(features, key=lambda name: name.encode() + b"\xff")
     entries = [encode_entry(name, *features[name]) for name in names]
     return encode_field(_FIRST, b"".join(entries))
@@ -236,7 +236,7 @@ def _find_content(head: bytes, start: int, end: int, tag: int) -> int:
 
 def _decode_integers(packed: bytes) -> Sequence[int] | np.ndarray:
     """Decode packed varints to signed 64-bit integers."""
-    if packed.isascii():  # one byte each, as flags
+    if packed.isascii():  # every varint is one byte, such as for flags
         return np.frombuffer(packed, np.uint8)
     integers, offset = [], 0
     while offset < len(packed):
