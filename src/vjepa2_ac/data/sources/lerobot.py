@@ -62,9 +62,9 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
     """The episodes of a LeRobot data set, v3.0 or v2.1, in the order of their numbers.
 
     For a local data set `infos` checks the states of every episode and the headers of the videos. For a remote data set
-    `infos` reads only the files in meta, unless `data.outcome` needs a value that only the rows have. The states are then
-    checked when an episode is read. `read` fetches the row groups with the episode's rows. Frames are fetched and decoded on
-    request.
+    `infos` reads only the files in meta, and states are checked when an episode is read. `infos` reads all states of a
+    remote data set only if `data.outcome` needs a value from the rows. `read` fetches the row groups with the episode's
+    rows. Frames are fetched and decoded on request.
     """
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - frames are fetched one by one
