@@ -29,7 +29,7 @@ from vjepa2_ac.config.section import Component
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.evaluation.action_use import rollout_start
+from vjepa2_ac.evaluation.action_use import make_transition
 from vjepa2_ac.intervals import bootstrap
 from vjepa2_ac.model.distances import squared_difference
 from vjepa2_ac.model.lora import merge_adapter
@@ -108,7 +108,7 @@ def main(words: Sequence[str] | None = None) -> None:
         for pixels in validation_batches(open_dataset(config.data), "test", clips=options.clips, batch_size=4):
             batch = encode_batch(model, pixels, device=device)
             for row in range(len(batch.starts)):
-                generator = rollout_start(batch, row, 0).generator(config.seed)
+                generator = make_transition(batch, row, 0).make_generator(config.seed)
                 place = int(generator.integers(batch.latents.shape[1] - STEPS))
                 ends = batch.actions[row, place : place + STEPS, :3].sum(dim=0).cpu()
                 cost = partial(

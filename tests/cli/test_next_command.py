@@ -71,7 +71,7 @@ def next_of_evaluate(
     first = SimpleNamespace(needs=needs, conclusion=predicts)
     planning = None if plans is None else SimpleNamespace(conclusion=plans)
     verdicts = (first, SimpleNamespace(conclusion="yes"), planning or SimpleNamespace(conclusion=ranks))
-    summary = SimpleNamespace(predicts=first, plans=planning, verdicts=verdicts)
+    summary = SimpleNamespace(prediction=first, planning=planning, verdicts=verdicts)
     return _next(SimpleNamespace(evaluation=SimpleNamespace(about=about), summary=summary), options)
 
 
@@ -90,7 +90,7 @@ def test_closed_loop_summary_includes_an_evaluation_of_the_same_checkpoint_only(
     trials = SimpleNamespace(task="reach", place="domain A", steps=20, seconds_per_step=0.25)
     options = parse(["simulate", str(tmp_path), "--task", "reach", "--domain", "A"])
     found = _summary(SimpleNamespace(subject=subject, trials=trials), verdict, options)
-    assert (found.predicts.name == "planning") == is_same
+    assert (found.prediction.name == "planning") == is_same
 
 
 def test_real_data_are_never_sent_to_the_simulated_arm(monkeypatch: pytest.MonkeyPatch) -> None:

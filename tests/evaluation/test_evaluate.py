@@ -68,8 +68,8 @@ def test_a_perfect_predictor_scores_zero_in_every_metric(oracle: Evaluation) -> 
                 assert one.value == pytest.approx(0.0, abs=1e-5)
     assert [one.value for one in gain_over(*pair_of(oracle))] == pytest.approx([1.0] * (TIME - 1))
     found = summarize(oracle, make_rows(oracle))
-    assert found.predicts.statement.startswith("error 100 % lower than the base model's")
-    assert found.uses_actions.conclusion == "yes"
+    assert found.prediction.statement.startswith("error 100 % lower than the base model's")
+    assert found.sensitivity.conclusion == "yes"
 
 
 def test_spread_and_mmd_equal_those_of_the_predicted_latents() -> None:
@@ -94,7 +94,7 @@ def test_a_model_that_ignores_actions_has_the_action_ranking_error_of_chance() -
     assert ranking.change == Estimate(0.0, 0.0, 0.0)
     assert set(ranking.ranks) == {0.5}
     assert gap_of_actions(found.models["adapter"].errors, "shuffled") == Estimate(0.0, 0.0, 0.0)
-    assert summarize(found, make_rows(found)).uses_actions.conclusion == "no"
+    assert summarize(found, make_rows(found)).sensitivity.conclusion == "no"
 
 
 def test_paired_difference_equals_manual_computation() -> None:

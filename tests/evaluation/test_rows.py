@@ -96,7 +96,7 @@ def test_an_added_metric_appears_in_rows_verdict_and_comparison(tmp_path: Path) 
 
 def test_metric_direction_decides_what_is_better() -> None:
     better, worse = (evaluated(*pair, LARGER) for pair in ((Oracle(), Halfway()), (Copier(), Halfway())))
-    assert not summarize(better, make_rows(better)).predicts.reference, "it agrees with L1"
-    assert not summarize(worse, make_rows(worse)).predicts.reference
+    assert not summarize(better, make_rows(better)).prediction.reference, "it agrees with L1"
+    assert not summarize(worse, make_rows(worse)).prediction.reference
     mistaken = evaluated(Oracle(), Halfway(), SMALLER)
-    assert "(by height " in summarize(mistaken, make_rows(mistaken)).predicts.reference
+    assert "(by height " in summarize(mistaken, make_rows(mistaken)).prediction.reference

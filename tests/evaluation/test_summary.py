@@ -1,4 +1,4 @@
-"""The summary states what was measured, draws the conclusions that follow, and fits a screen."""
+"""The summary has the measured numbers and the conclusions that follow from them, and fits a screen."""
 
 import json
 import math
@@ -44,18 +44,18 @@ CLIPS, HORIZON = 24, 3
 
 
 def errors(level: float, noise: float = 0.0) -> np.ndarray:
-    """Return errors of about `level` times those of persistence, 0.5."""
+    """Return errors of about `level` times those of persistence, which are 0.5."""
     rng = np.random.default_rng(int(level * 1000))
     return 0.5 * (level + noise * rng.standard_normal((CLIPS, HORIZON)))
 
 
-def predicted(episodes: int = 8, **ways: dict[Metric, np.ndarray]) -> PredictionErrors:
-    """Return errors of each way of predicting, by metric, in either mode."""
+def prediction_errors(episodes: int = 8, **by_actions: dict[Metric, np.ndarray]) -> PredictionErrors:
+    """Return errors by actions and metric, equal for both modes."""
     ids = tuple(f"episode {clip % episodes}" for clip in range(CLIPS))
-    ways = {"persistence": dict.fromkeys((L1, L2), errors(1.0)), **ways}
+    by_actions = {"persistence": dict.fromkeys((L1, L2), errors(1.0)), **by_actions}
     arrays = {
         (actions, mode, metric.name): values
-        for actions, by_metric in ways.items()
+        for actions, by_metric in by_actions.items()
         for metric, values in by_metric.items()
         for mode in MODES
     }
@@ -65,11 +65,11 @@ def predicted(episodes: int = 8, **ways: dict[Metric, np.ndarray]) -> Prediction
 def model(
     name: str, level: float, *, noise: float = 0.02, shuffled: float | None = None, episodes: int = 8
 ) -> ModelResult:
-    of_true, others = (
-        dict.fromkeys((L1, L2), errors(one, noise)) for one in (level, level if shuffled is None else shuffled)
+    true, wrong = (
+        dict.fromkeys((L1, L2), errors(each, noise)) for each in (level, level if shuffled is None else shuffled)
     )
-    found = predicted(episodes, true=of_true, zero=others, shuffled=others)
-    return ModelResult(name, "base" if name == "base" else "trained", found)
+    by_actions = prediction_errors(episodes, true=true, zero=wrong, shuffled=wrong)
+    return ModelResult(name, "base" if name == "base" else "trained", by_actions)
 
 
 def evaluation(*models: ModelResult, episodes: int = 8) -> Evaluation:
@@ -106,38 +106,38 @@ def test_better_prediction_needs_a_lower_error_than_the_base_model_and_persisten
 ) -> None:
     base_model = [] if base is None else [model("base", base, noise=noise)]
     summary = summary_of(*base_model, model("adapter", adapter, noise=noise))
-    assert summary.predicts.conclusion == conclusion
-    assert statement in summary.predicts.statement
-    assert summary.predicts.compared_with in summary.predicts.statement
-    denied = f"Prediction is not better than {summary.predicts.compared_with}. Check data, axes and stride first."
+    assert summary.prediction.conclusion == conclusion
+    assert statement in summary.prediction.statement
+    assert summary.prediction.compared_with in summary.prediction.statement
+    denied = f"Prediction is not better than {summary.prediction.compared_with}. Check data, axes and stride first."
     assert (summary.sentence == denied) == (conclusion == "no")
 
 
 def test_interval_has_the_sign_of_the_statement() -> None:
     for adapter, word in ((0.9, "lower"), (1.1, "higher")):
-        predicts = summary_of(model("base", 1.0), model("adapter", adapter)).predicts
-        low, high = map(float, predicts.interval.strip("[]").split(","))
-        assert word in predicts.statement
-        assert 0 < low <= float(predicts.statement.split()[1]) <= high
+        prediction = summary_of(model("base", 1.0), model("adapter", adapter)).prediction
+        low, high = map(float, prediction.interval.strip("[]").split(","))
+        assert word in prediction.statement
+        assert 0 < low <= float(prediction.statement.split()[1]) <= high
 
 
-SHARES = {"adapter": estimate_share(45, 50), "random": estimate_share(0, 50), "oracle": estimate_share(50, 50)}
+RATES = {"adapter": estimate_share(45, 50), "random": estimate_share(0, 50), "oracle": estimate_share(50, 50)}
 
 
-def test_printed_interval_follows_its_number_and_one_line_names_its_unit() -> None:
+def test_printed_interval_follows_its_number_and_one_line_explains_intervals() -> None:
     summary = summary_of(ranked("base", 1.0, 0.2), ranked("adapter", 0.75, 0.02))
     printed = str(summary)
-    ranking = summary.ranks_actions
+    ranking = summary.ranking
     assert f"{ranking.statement} {ranking.interval} (base model" in printed
     assert "  Brackets: 95 % intervals over episodes\n" in printed
-    rate = closed_loop_verdict(SHARES, "adapter", "oracle", 50, "reach")
-    text = " ".join(str(replace(summary, plans=rate)).split())
+    rate = closed_loop_verdict(RATES, "adapter", "oracle", 50, "reach")
+    text = " ".join(str(replace(summary, planning=rate)).split())
     assert f"success rate 90 % {rate.interval} on 50 reach problems" in text
     assert "Brackets: 95 % intervals over episodes and (success rate) problems" in text
 
 
 def ranked(name: str, level: float, rank: float, **changes: Any) -> ModelResult:
-    """Return a model with an error and an action-ranking error, which differs a little by clip."""
+    """Return a model with an error level and an action-ranking error that differs slightly between clips."""
     ids = tuple(f"episode {clip % 8}" for clip in range(CLIPS))
     return replace(model(name, level, **changes), ranking=ranking_of(rank + 0.01 * np.sin(np.arange(CLIPS)), ids))
 
@@ -158,11 +158,11 @@ def test_better_action_ranking_needs_a_lower_error_than_chance_and_the_base_mode
 ) -> None:
     base_model = [] if base is None else [ranked("base", 1.0, base)]
     summary = summary_of(*base_model, ranked("adapter", 0.7, rank, shuffled=0.9))
-    ranks_actions = summary.ranks_actions
-    assert (ranks_actions.conclusion, ranks_actions.compared_with) == (conclusion, compared_with)
-    assert ranks_actions.value == pytest.approx(rank, abs=0.002)
+    ranking = summary.ranking
+    assert (ranking.conclusion, ranking.compared_with) == (conclusion, compared_with)
+    assert ranking.value == pytest.approx(rank, abs=0.002)
     if rank > 0.5:
-        assert summary.uses_actions.conclusion == "no", "a model that ranks worse than chance is not sensitive to them"
+        assert summary.sensitivity.conclusion == "no", "action ranking is worse than chance"
         assert summary.sentence == "Action ranking is worse than chance, so the model cannot be used for planning."
     elif conclusion == "no":
         assert summary.sentence == "Action ranking is not better than the base model."
@@ -170,18 +170,18 @@ def test_better_action_ranking_needs_a_lower_error_than_chance_and_the_base_mode
         assert summary.sentence.endswith(f"better action ranking than {compared_with}. Planning was not measured.")
 
 
-def test_the_third_line_is_action_ranking_until_a_closed_loop_was_measured(tmp_path: Path) -> None:
+def test_the_third_line_is_planning_if_a_closed_loop_was_measured_and_action_ranking_otherwise(tmp_path: Path) -> None:
     bare, measured = summary_of(model("model", 0.5)), summary_of(ranked("model", 0.5, 0.02, shuffled=0.9))
-    assert bare.ranks_actions == not_measured_verdict(RANKING, "`vjepa2-ac evaluate --ranking-clips 32`")
-    shares = {name: estimate_share(count, 50) for name, count in {"m": 45, "random": 2, "oracle": 50}.items()}
-    plans = closed_loop_verdict(shares, "m", "oracle", 50, "reach")
+    assert bare.ranking == not_measured_verdict(RANKING, "`vjepa2-ac evaluate --ranking-clips 32`")
+    rates = {name: estimate_share(count, 50) for name, count in {"m": 45, "random": 2, "oracle": 50}.items()}
+    planning = closed_loop_verdict(rates, "m", "oracle", 50, "reach")
     (tmp_path / "closed_loop" / "reach-B").mkdir(parents=True)
     file = tmp_path / "closed_loop" / "reach-B" / "closed_loop.json"
-    file.write_text(json.dumps({"about": {"checkpoint": "step-8 (the newest)"}, "verdict": asdict(plans)}))
+    file.write_text(json.dumps({"about": {"checkpoint": "step-8 (the newest)"}, "verdict": asdict(planning)}))
     for summary in (bare, measured):
-        planned = with_closed_loop(summary, tmp_path, "step-8 (the newest)")
-        assert [one.name for one in summary.verdicts] == [PREDICTION, SENSITIVITY, RANKING]
-        assert planned.verdicts == (*summary.verdicts[:2], plans)
+        with_planning = with_closed_loop(summary, tmp_path, "step-8 (the newest)")
+        assert [verdict.name for verdict in summary.verdicts] == [PREDICTION, SENSITIVITY, RANKING]
+        assert with_planning.verdicts == (*summary.verdicts[:2], planning)
         assert with_closed_loop(summary, tmp_path, "step-9 (the newest)") == summary
         assert with_closed_loop(summary, tmp_path / "no", "step-8 (the newest)") == summary
         assert PLANNING not in str(summary)
@@ -192,19 +192,19 @@ def test_the_third_line_is_action_ranking_until_a_closed_loop_was_measured(tmp_p
 
 def test_sensitivity_to_actions_needs_a_higher_error_with_shuffled_actions() -> None:
     ignoring, sensitive = summary_of(model("model", 0.5)), summary_of(model("model", 0.5, shuffled=0.9))
-    assert (ignoring.uses_actions.conclusion, sensitive.uses_actions.conclusion) == ("no", "yes")
+    assert (ignoring.sensitivity.conclusion, sensitive.sensitivity.conclusion) == ("no", "yes")
     assert ignoring.sentence.startswith("The model predicts typical motion and ignores the actions")
-    misled = summary_of(model("model", 0.9, shuffled=0.5))
-    assert misled.uses_actions.statement == "one-step error 45 % lower with shuffled actions"
-    assert misled.sentence.startswith("The error is lower with shuffled actions than with true ones.")
-    assert sensitive.uses_actions.statement == "one-step error 81 % higher with shuffled actions"
+    inverse = summary_of(model("model", 0.9, shuffled=0.5))
+    assert inverse.sensitivity.statement == "one-step error 45 % lower with shuffled actions"
+    assert inverse.sentence.startswith("The error is lower with shuffled actions than with true ones.")
+    assert sensitive.sensitivity.statement == "one-step error 81 % higher with shuffled actions"
 
 
 @pytest.mark.parametrize("episodes", [1, 4])
 def test_too_few_episodes_give_numbers_without_conclusions(episodes: int) -> None:
-    models = [model(*one, episodes=episodes) for one in (("base", 1.0), ("adapter", 0.5))]
+    models = [model(name, level, episodes=episodes) for name, level in (("base", 1.0), ("adapter", 0.5))]
     summary = summary_of(*models, episodes=episodes)
-    assert [one.conclusion for one in summary.verdicts] == ["inconclusive", "inconclusive", "not measured"]
+    assert [verdict.conclusion for verdict in summary.verdicts] == ["inconclusive", "inconclusive", "not measured"]
     verb = "episode is" if episodes == 1 else "episodes are"
     assert summary.sentence.startswith(f"{episodes} held-out {verb} too few for a conclusion; at least 5 are needed.")
     assert summary.sentence.endswith("1.5 s ahead; one-step error 0.0 % higher with shuffled actions.")
@@ -213,15 +213,15 @@ def test_too_few_episodes_give_numbers_without_conclusions(episodes: int) -> Non
 
 def test_measurement_on_too_few_episodes_has_no_conclusion() -> None:
     adapter = ranked("adapter", 0.7, 0.6, shuffled=0.9)
-    few = replace(adapter, ranking=ranking_of(np.array([0.6, 0.6]), ("episode 1", "episode 2")))
-    summary = summary_of(few, episodes=8)
-    assert (summary.ranks_actions.conclusion, summary.ranks_actions.interval) == ("inconclusive", "")
-    assert summary.ranks_actions.reference == "(chance 50 %; 2 episodes are too few for a conclusion)"
-    assert summary.uses_actions.conclusion == "yes"
+    adapter = replace(adapter, ranking=ranking_of(np.array([0.6, 0.6]), ("episode 1", "episode 2")))
+    summary = summary_of(adapter, episodes=8)
+    assert (summary.ranking.conclusion, summary.ranking.interval) == ("inconclusive", "")
+    assert summary.ranking.reference == "(chance 50 %; 2 episodes are too few for a conclusion)"
+    assert summary.sensitivity.conclusion == "yes"
     assert summary.sentence == "Inconclusive: better action ranking. Measure more clips, with --ranking-clips."
-    unclear = replace(summary, predicts=replace(summary.predicts, conclusion="inconclusive"))
-    both = "Inconclusive: better prediction, better action ranking. Measure more clips, with --ranking-clips."
-    assert unclear.sentence == both
+    summary = replace(summary, prediction=replace(summary.prediction, conclusion="inconclusive"))
+    sentence = "Inconclusive: better prediction, better action ranking. Measure more clips, with --ranking-clips."
+    assert summary.sentence == sentence
 
 
 def with_spread(result: ModelResult, spread: float) -> ModelResult:
@@ -237,28 +237,25 @@ def test_blur_is_reported_only_if_error_and_spread_both_decrease(with_base: bool
     adapter = with_spread(model("adapter", level, noise=0.0), spread)
     base_model = [with_spread(model("base", 1.0, noise=0.0), 0.9)] * with_base
     summary = summary_of(*base_model, adapter, copies=adapter.distribution)
-    before, name = (0.9, "base model") if with_base else (1.0, "true latents")
-    fell = level < 0.99 and spread < 0.99 * before
-    remark = f"(part of the gain may be blur: spread {spread:.2f}, {name} {before:.2f})"
-    assert summary.predicts.reference == (remark if fell else "")
-    weak = summary_of(
-        *base_model, with_spread(model("adapter", level, noise=0.0), math.nan), copies=adapter.distribution
-    )
-    assert not weak.predicts.reference, "there is no spread with one clip"
+    reference, name = (0.9, "base model") if with_base else (1.0, "true latents")
+    has_decreased = level < 0.99 and spread < 0.99 * reference
+    remark = f"(part of the gain may be blur: spread {spread:.2f}, {name} {reference:.2f})"
+    assert summary.prediction.reference == (remark if has_decreased else "")
+    without_spread = with_spread(model("adapter", level, noise=0.0), math.nan)
+    assert not summary_of(*base_model, without_spread, copies=adapter.distribution).prediction.reference
 
 
 def with_landscape(result: ModelResult, distance: float, sharpness: float, episodes: int = 8) -> ModelResult:
-    """Return a model with landscapes of a mean distance and sharpness, which differ a little by clip."""
+    """Return a model with landscapes of a sharpness, and of a mean distance that differs slightly between clips."""
     rng, ids = np.random.default_rng(0), [f"episode {number}" for number in range(episodes)]
     distances = distance + rng.uniform(-0.5, 0.5, episodes)
     energy = np.full((2, 2, 2), 1.0)
     energy[0, 0, 0], energy[1, 1, 1] = 1 - sharpness / 2, 1 + sharpness / 2
     maps = tuple(
-        Landscape(name, 0, np.zeros((3, 2)), energy, np.zeros(3), np.array([one, 0.0, 0.0]))
-        for name, one in zip(ids, distances, strict=True)
+        Landscape(name, 0, np.zeros((3, 2)), energy, np.zeros(3), np.array([each, 0.0, 0.0]))
+        for name, each in zip(ids, distances, strict=True)
     )
-    found = Landscapes(("dx", "dy", "dz"), "cm", maps, 25.0)
-    return replace(result, landscapes=found)
+    return replace(result, landscapes=Landscapes(("dx", "dy", "dz"), "cm", maps, 25.0))
 
 
 @pytest.mark.parametrize(
@@ -294,7 +291,7 @@ def test_predictions_that_are_not_finite_have_no_conclusion() -> None:
     }
     adapter = replace(adapter, errors=replace(adapter.errors, arrays=adapter.errors.arrays | broken))
     summary = summary_of(model("base", 1.0), adapter)
-    assert (summary.predicts.conclusion, summary.predicts.value) == ("not measured", None)
+    assert (summary.prediction.conclusion, summary.prediction.value) == ("not measured", None)
     assert "nan" not in str(summary)
 
 
@@ -308,24 +305,24 @@ def test_sentence_mentions_a_landscape_that_is_not_better(distance: float) -> No
     assert len(sentence.split()) <= 40
 
 
-def by(l1: float, others: float, *, noise: float = 0.02) -> dict[Metric, np.ndarray]:
-    """Return errors for which L1 differs from L2 relative to persistence."""
-    return {L1: errors(l1, noise), L2: errors(others, noise)}
+def errors_by_metric(l1: float, l2: float, *, noise: float = 0.02) -> dict[Metric, np.ndarray]:
+    """Return errors whose levels relative to persistence differ between L1 and L2."""
+    return {L1: errors(l1, noise), L2: errors(l2, noise)}
 
 
-def with_errors(found: Evaluation, name: str, true: dict[Metric, np.ndarray]) -> Evaluation:
-    before = found.models[name].errors
-    given = {(actions, mode, metric.name): values for metric, values in true.items()
+def with_errors(measured: Evaluation, name: str, true: dict[Metric, np.ndarray]) -> Evaluation:
+    errors = measured.models[name].errors
+    changes = {(actions, mode, metric.name): values for metric, values in true.items()
              for actions, mode in (("true", "teacher_forced"), ("true", "rollout"))}  # fmt: skip
-    changed = replace(found.models[name], errors=replace(before, arrays={**before.arrays, **given}))
-    return replace(found, models={**found.models, name: changed})
+    changed = replace(measured.models[name], errors=replace(errors, arrays={**errors.arrays, **changes}))
+    return replace(measured, models={**measured.models, name: changed})
 
 
 def test_metric_that_contradicts_l1_is_reported() -> None:
     agreed = evaluation(model("base", 0.95), model("adapter", 0.8))
-    assert not summarize(agreed, make_rows(agreed)).predicts.reference
-    denied = with_errors(agreed, "adapter", by(0.8, 1.25))
-    assert re.fullmatch(r"\(by L2 32 % worse \[\d+, \d+\]\)", summarize(denied, make_rows(denied)).predicts.reference)
+    assert not summarize(agreed, make_rows(agreed)).prediction.reference
+    denied = with_errors(agreed, "adapter", errors_by_metric(0.8, 1.25))
+    assert re.fullmatch(r"\(by L2 32 % worse \[\d+, \d+\]\)", summarize(denied, make_rows(denied)).prediction.reference)
 
 
 @pytest.mark.parametrize(
@@ -339,23 +336,22 @@ def test_metric_that_contradicts_l1_is_reported() -> None:
         (2, 2, 2, "inconclusive", "2 problems are too few for a conclusion"),
     ],
 )
-def test_a_closed_loop_is_compared_with_policies_that_receive_no_image(
+def test_better_planning_needs_a_higher_success_rate_than_policies_without_images(
     solved: int, problems: int, oracle: int, conclusion: str, needs: str
 ) -> None:
     counts = {"adapter": solved, "zero action": 0, "random": min(2, problems - 1), "oracle": oracle}
-    shares = {name: estimate_share(count, problems) for name, count in counts.items()}
-    plans = closed_loop_verdict(shares, "adapter", "oracle", problems, "reach")
-    assert plans.conclusion == conclusion
-    assert plans.needs.startswith(needs)
-    assert bool(plans.needs) == bool(needs)
-    assert plans.statement.endswith(f"on {problems} reach problem{'s' * (problems > 1)}")
+    rates = {name: estimate_share(count, problems) for name, count in counts.items()}
+    planning = closed_loop_verdict(rates, "adapter", "oracle", problems, "reach")
+    assert planning.conclusion == conclusion
+    assert planning.needs.startswith(needs)
+    assert bool(planning.needs) == bool(needs)
+    assert planning.statement.endswith(f"on {problems} reach problem{'s' * (problems > 1)}")
 
 
 def test_measured_planning_removes_the_consequence_for_planning() -> None:
     summary = summary_of(model("adapter", 0.5))
     assert summary.sentence.endswith("ignores the actions, so the model cannot be used for planning.")
-    shares = {"adapter": estimate_share(45, 50), "random": estimate_share(0, 50), "oracle": estimate_share(50, 50)}
-    measured = replace(summary, plans=closed_loop_verdict(shares, "adapter", "oracle", 50, "reach"))
+    measured = replace(summary, planning=closed_loop_verdict(RATES, "adapter", "oracle", 50, "reach"))
     assert measured.sentence == "The model predicts typical motion and ignores the actions."
 
 
@@ -368,14 +364,14 @@ def test_summary_fits_a_screen_and_has_complete_sentences(
     episodes: int, with_base: bool, level: float, shuffled: float, rank: float, distance: float
 ) -> None:
     models = [ranked("base", 1.0, 0.05)] * with_base + [ranked("adapter", level, rank, shuffled=shuffled, noise=0.1)]
-    spread = [with_spread(one, 0.9 if one.role == "base" else 0.8) for one in models]
-    measured = evaluation(*(with_landscape(one, distance, 0.0086, episodes) for one in spread), episodes=episodes)
+    models = [with_spread(each, 0.9 if each.role == "base" else 0.8) for each in models]
+    measured = evaluation(*(with_landscape(each, distance, 0.0086, episodes) for each in models), episodes=episodes)
     subject = f"runs/{'a-kitchen-with-a-name-that-is-long-enough-to-wrap-' * 2}"
-    measured = replace(measured, about=replace(measured.about, subject=subject), copies=spread[0].distribution)
-    measured = with_errors(measured, "adapter", by(level, abs(2 - level)))
+    measured = replace(measured, about=replace(measured.about, subject=subject), copies=models[0].distribution)
+    measured = with_errors(measured, "adapter", errors_by_metric(level, abs(2 - level)))
     summary = summarize(measured, make_rows(measured))
     lines = str(summary).splitlines()
-    assert len(lines) <= 18, "three of them are the long name and the clips"
+    assert len(lines) <= 18, "three lines are the long name and the clips"
     assert max(map(len, lines)) <= 90
     assert lines[2] == f"24 clips, {episodes} held-out episode{'s' * (episodes > 1)}"
     assert len(summary.sentence.split()) <= 40

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from vjepa2_ac.evaluation.action_use import RolloutStart, rollout_start
+from vjepa2_ac.evaluation.action_use import Transition, make_transition
 from vjepa2_ac.inspection.axes import AxisFit, infer_axes
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.energy import AxesRotation
@@ -28,9 +28,9 @@ class Turned(Oracle):
         return super().predict(latents, back, states, extrinsics)
 
 
-def starts(**changes: object) -> list[RolloutStart]:
+def starts(**changes: object) -> list[Transition]:
     batch = clips_batch(CLIPS, **changes)  # type: ignore[arg-type]
-    return [rollout_start(batch, clip, 1) for clip in range(CLIPS)]
+    return [make_transition(batch, clip, 1) for clip in range(CLIPS)]
 
 
 def fitted(model: object, **changes: object) -> AxisFit:
@@ -68,7 +68,7 @@ def test_insignificant_or_uncertain_angle_is_a_problem() -> None:
 def test_mirrored_axes_or_a_single_episode_are_a_problem() -> None:
     assert fitted(Turned(0.0, mirrored=True)).problem is not None
     batch = clips_batch(2)
-    alone = infer_axes(Oracle(), [rollout_start(batch, clip, step) for clip in (0, 1) for step in range(TIME - 1)],
+    alone = infer_axes(Oracle(), [make_transition(batch, clip, step) for clip in (0, 1) for step in range(TIME - 1)],
                        at_once=64)  # fmt: skip
     assert "found 1" in (alone.problem or "")
 

@@ -82,14 +82,14 @@ def of_runs(found: Comparison, conclusion: Conclusion = "yes", **runs: tuple[flo
     one, curve = next(iter(found.measured.items()))[1], next(iter(found.curves.values()))
     measured, curves = {}, {}
     for name, (rank, error, step) in runs.items():
-        ranks = replace(one.summary.ranks_actions, value=rank, conclusion=conclusion)
+        ranks = replace(one.summary.ranking, value=rank, conclusion=conclusion)
         about = replace(
             one.about,
             checkpoint=f"step-{step:08d} (as requested)",
             checkpoint_path=f"run/step-{step:08d}",
             is_base=not step,
         )
-        measured[name] = replace(one, summary=replace(one.summary, ranks_actions=ranks), about=about)
+        measured[name] = replace(one, summary=replace(one.summary, ranking=ranks), about=about)
         curves[name] = (*curve[:-1], replace(curve[-1], value=error))
     rows = [row for row in found.rows if row.key == "gain_over_first"]
     gains = tuple(replace(rows[0], model=name) for name in list(runs)[1:])
@@ -131,7 +131,7 @@ def test_too_few_episodes_give_no_recommendation_and_no_difference(two: Comparis
     few = "1 held-out episode is too few for a conclusion; at least 5 are needed"
     summaries = {name: one.summary for name, one in found.measured.items()}
     summaries = {
-        name: replace(one, predicts=replace(one.predicts, needs=f"{few}. So far: error 1 % lower."))
+        name: replace(one, prediction=replace(one.prediction, needs=f"{few}. So far: error 1 % lower."))
         for name, one in summaries.items()
     }
     measured = {name: replace(one, summary=summaries[name]) for name, one in found.measured.items()}

@@ -85,7 +85,7 @@ def images(html: str) -> list[bytes]:
 
 @pytest.mark.usefixtures("without_figures")
 def test_first_screen_shows_the_console_summary_and_further_numbers(usual: Usual) -> None:
-    for one, changes in ((usual[0], {}), (evaluation(episodes=2, clips=8), {"plans": SOLVED})):
+    for one, changes in ((usual[0], {}), (evaluation(episodes=2, clips=8), {"planning": SOLVED})):
         summary = replace(summarize(one, make_rows(one)), **changes)
         first = report_page(one, summary).partition("<details")[0]
         shown = " ".join(Page(re.sub("<[^>]*>", " ", first.partition("</style>")[2])).shown.split())

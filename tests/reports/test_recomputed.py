@@ -92,7 +92,7 @@ def recomputed(metrics: dict[str, Any]) -> dict[str, tuple[str, str, str]]:
     if base:
         of_base, reference, reference_error = models[base]["distribution"], "base model", "the base model's"
         before = of_base["variance"][-1] / of_base["true_variance"][-1]
-    found["predicts"] = (
+    found["prediction"] = (
         f"error {share} % lower than {reference_error}, {ahead}",
         interval,
         f"(part of the gain may be blur: spread {spread:.2f}, {reference} {before:.2f})",
@@ -100,12 +100,12 @@ def recomputed(metrics: dict[str, Any]) -> dict[str, tuple[str, str, str]]:
 
     errors = by_clip["one_step"][name]
     cost = with_interval(*estimate(lambda sums: sums[0] / sums[1] - 1, [errors["shuffled"], errors["true"]], ids))
-    found["uses_actions"] = f"one-step error {cost[0]} % higher with shuffled actions", cost[1], ""
+    found["sensitivity"] = f"one-step error {cost[0]} % higher with shuffled actions", cost[1], ""
 
     ranking = models[name]["ranking"]
     error, interval = with_interval(*mean(ranking["ranks"], ranking["episode_ids"]))
     of_base = f"base model {percent(float(np.mean(models[base]['ranking']['ranks'])))} %, " if base else ""
-    found["ranks_actions"] = f"action-ranking error {error} %", interval, f"({of_base}chance 50 %)"
+    found["ranking"] = f"action-ranking error {error} %", interval, f"({of_base}chance 50 %)"
 
     def landscape(model: str) -> tuple[tuple[float, float, float], float, float]:
         maps = models[model]["landscapes"]["maps"]

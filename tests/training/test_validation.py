@@ -10,7 +10,7 @@ from same_run import assert_same_run
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.action_use import RolloutStart
+from vjepa2_ac.evaluation.action_use import Transition
 from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.runs.subject import describe_selection
@@ -68,7 +68,7 @@ def test_unreadable_clips_are_replaced_in_the_ranking(make_config, reporter, mon
             raise InputError(where="a clip", found="its image is damaged")
         return read(dataset, request)
 
-    def rank(_model: object, moves: list[RolloutStart], *_: object, **__: object) -> None:
+    def rank(_model: object, moves: list[Transition], *_: object, **__: object) -> None:
         ranked.extend((move.episode_id, move.first_step) for move in moves)
 
     monkeypatch.setattr(loader, "read_clip", some_read)

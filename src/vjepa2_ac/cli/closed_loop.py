@@ -296,23 +296,25 @@ def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
     subject, trials = benchmark.subject, benchmark.trials
-    how = _evaluate_command(options) or "`vjepa2-ac evaluate`"
-    predicts, uses, ranks = (not_measured_verdict(name, how) for name in (PREDICTION, SENSITIVITY, RANKING))
+    command = _evaluate_command(options) or "`vjepa2-ac evaluate`"
+    prediction, sensitivity, ranking = (
+        not_measured_verdict(name, command) for name in (PREDICTION, SENSITIVITY, RANKING)
+    )
     measured = f"{trials.task}, {trials.place}, {counted(trials.steps, 'step')} of {trials.seconds_per_step:.2f} s"
-    summary = Summary(subject.name, measured, predicts, uses, ranks, verdict)
+    summary = Summary(subject.name, measured, prediction, sensitivity, ranking, verdict)
     if subject.chosen and (Path(subject.name) / METRICS_FILE).is_file():
         with contextlib.suppress(InputError):  # metrics.json has an older format: keep "not measured"
             evaluated = read_metrics(Path(subject.name))
             # Only the names are compared, because older files describe the selection in other words.
             names = {text.partition(" ")[0] for text in (evaluated.about.checkpoint, subject.chosen)}
             if len(names) == 1:
-                summary = replace(evaluated.summary, measured=measured, plans=verdict)
+                summary = replace(evaluated.summary, measured=measured, planning=verdict)
     return summary
 
 
 def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> list[str]:
     """Return a line with the recommended next command; empty if there is none."""
-    is_evaluated, command = summary.predicts.value is not None, _evaluate_command(options)
+    is_evaluated, command = summary.prediction.value is not None, _evaluate_command(options)
     if verdict.needs or options.sub_goals is not None:  # the verdict names the fix; a server plans without sub-goals
         return []
     if verdict.conclusion == "yes" and (is_evaluated or not command):

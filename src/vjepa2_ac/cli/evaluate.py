@@ -135,10 +135,10 @@ def _next(measured: WrittenEvaluation, options: argparse.Namespace) -> list[str]
     if not about.checkpoint:
         is_other = cli.read_config(config).model.base not in {RANDOM, about.subject}
         words = ["train", config, *[f"model.base={about.subject}"] * is_other]
-    elif not summary.predicts.needs:
+    elif not summary.prediction.needs:
         if about.is_base or "no" in {verdict.conclusion for verdict in summary.verdicts[:3]}:
             words += ["--model", about.subject] * (not any(map(sets_movable_path, settings)))
-        elif summary.plans is None and (simulation := _simulation(about, options)):
+        elif summary.planning is None and (simulation := _simulation(about, options)):
             words = simulation
         elif summary.verdicts[2].conclusion == "yes":  # `serve` is recommended only after a measured improvement
             words = ["serve", about.subject, *cli.option_words(options, "checkpoint"), *settings]

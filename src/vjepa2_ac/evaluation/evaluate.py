@@ -1,4 +1,4 @@
-"""Measurement of several models (the trained model, its base model, others) on the same held-out clips."""
+"""Measure several models on the same held-out clips: the trained model, its base model, and any other models."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.distributed import gather_shared
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_use import (
-    RolloutStart,
-    gather_starts,
+    Transition,
+    gather_transitions,
+    make_transition,
     measure_landscapes,
     rank_actions,
-    rollout_start,
     select_moves,
 )
 from vjepa2_ac.evaluation.distribution import LatentSums, compare_distributions, frechet_distance_of_halves
@@ -63,12 +63,12 @@ FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  
 
 @dataclass(frozen=True)
 class EvaluatedModel:
-    """A model to measure."""
+    """A model to measure, with its name and its role in the evaluation."""
 
     name: str
     role: Role
     model: Predictor
-    # Context in which the model predicts, for models that share weights.
+    # Returns the context in which the model predicts; for models that share weights, it selects the model's weights.
     prediction_context: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext
 
 
@@ -77,7 +77,8 @@ class RepeatableClips:
     """Clips that can be read repeatedly, as batches of latents with their frames."""
 
     names: Sequence[ClipName]  # all clips
-    read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]  # None: all of this process
+    # Reads the clips with these names, as batches; None: all clips of this process.
+    read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]
     space: ActionSpace = POSE_CHANGE  # meaning of the actions
     has_frames: bool = True  # False for cached latents, which have small frames only
     before: Float[Tensor, "1 time action_dim"] | None = None  # see `with_shuffled_actions`
@@ -100,47 +101,48 @@ def evaluate(
         clips: One or more clips.
         about: Description of the evaluation.
         metrics: Metrics of the errors, L1 first; None: all registered metrics.
-        probes: Options of the measurements beyond the errors.
+        probes: Options of action ranking, energy landscapes and examples; None: the defaults.
         reporter: Shows the progress of each part of the work.
     """
     probes, metrics = probes or ProbeOptions(), metrics or registered_metrics()
-    sums = _collect(evaluated_models, clips, probes, metrics, reporter.task("measuring"))
-    known = describe_clips(sums.actions, sums.names, space=clips.space, seconds_per_step=about.seconds_per_step)
-    width, starts = sums.actions.shape[-1], sums.starts
-    is_moving = {name: bool(steps.any()) for name, steps in zip(sums.names, known.moving, strict=True)}
-    moving = [start for start in starts if is_moving[start.episode_id, start.first_step]] or starts
-    mapped = [moving[index] for index in spread_indices(len(moving), probes.landscape_clips)]
+    collected = _collect(evaluated_models, clips, probes, metrics, reporter.task("measuring"))
+    actions, transitions = collected.actions, collected.transitions
+    clips_info = describe_clips(actions, collected.names, space=clips.space, seconds_per_step=about.seconds_per_step)
+    is_moving = {name: bool(steps.any()) for name, steps in zip(collected.names, clips_info.moving, strict=True)}
+    moving = [each for each in transitions if is_moving[each.episode_id, each.first_step]] or transitions
+    landscape_transitions = [moving[index] for index in spread_indices(len(moving), probes.landscape_clips)]
+    action_dim = actions.shape[-1]
     models: dict[str, ModelResult] = {}
     for evaluated_model in evaluated_models:
         model, name = evaluated_model.model, evaluated_model.name
         ranking, landscapes = None, None
         with evaluated_model.prediction_context():
-            if starts:
+            if transitions:
                 task = reporter.task(f"action ranking, {name}")
-                ranking = rank_actions(model, sums.moves, clips.space, probes, seed=about.seed, progress=task)
-            if mapped and width >= 3:
+                ranking = rank_actions(model, collected.moves, clips.space, probes, seed=about.seed, progress=task)
+            if landscape_transitions and action_dim >= 3:
                 task = reporter.task(f"energy landscapes, {name}")
-                landscapes = measure_landscapes(model, mapped, clips.space, probes, task)
-        distribution = compare_distributions(sums.predicted[name], sums.true)
-        errors = concatenate_errors(sums.errors[name])
+                landscapes = measure_landscapes(model, landscape_transitions, clips.space, probes, task)
+        distribution = compare_distributions(collected.predicted[name], collected.true)
+        errors = concatenate_errors(collected.errors[name])
         models[name] = ModelResult(name, evaluated_model.role, errors, landscapes, ranking, distribution)
     errors = next(result.errors for result in models.values() if result.role == "trained")
-    note = f"No energy landscapes: an action has {width} numbers, and a landscape is over three."
+    note = f"No energy landscapes: they need actions of at least three numbers, and an action has {action_dim} numbers."
     return Evaluation(
         about=about,
-        clips=known,
+        clips=clips_info,
         models=models,
-        examples=_examples(evaluated_models, clips, known, errors, probes.examples),
-        notes=(note,) if mapped and width < 3 else (),
+        examples=_examples(evaluated_models, clips, clips_info, errors, probes.examples),
+        notes=(note,) if landscape_transitions and action_dim < 3 else (),
         metrics=metrics,
-        copies=compare_distributions(sums.copies, sums.true),
-        fvd_of_halves=frechet_distance_of_halves(sums.true),
+        copies=compare_distributions(collected.copies, collected.true),
+        fvd_of_halves=frechet_distance_of_halves(collected.true),
     )
 
 
 @dataclass(frozen=True)
 class _Collected:
-    """Errors, actions, sums of latents, and starts for probing, collected over the clips of all processes."""
+    """Errors, actions, sums of latents, and transitions, collected over the clips of all processes."""
 
     errors: dict[str, list[PredictionErrors]]  # by model
     predicted: dict[str, LatentSums]  # rollouts with the true actions, by model
@@ -148,8 +150,8 @@ class _Collected:
     copies: LatentSums  # copies of frame 0 (persistence)
     actions: Float[np.ndarray, "clips horizon action_dim"]
     names: list[ClipName]
-    starts: list[RolloutStart]
-    moves: list[RolloutStart]
+    transitions: list[Transition]  # the step with the largest action of each clip for action ranking
+    moves: list[Transition]  # the moves of the same clips
 
 
 def _collect(
@@ -160,27 +162,26 @@ def _collect(
     progress: Progress,
 ) -> _Collected:
     batches = with_shuffled_actions((batch for batch, _ in clips.read(None)), clips.before)
-    first = list(itertools.islice(batches, 1))
-    if not (
-        origins := gather_shared([batch.latents[:, 1:].float().flatten(2).mean(dim=0).cpu() for batch, _ in first])
-    ):
+    first_batch = list(itertools.islice(batches, 1))  # empty if this process has no clips
+    origins = [batch.latents[:, 1:].float().flatten(2).mean(dim=0).cpu() for batch, _ in first_batch]
+    if not (origins := gather_shared(origins)):
         raise no_readable_clips()
     predicted = {model.name: LatentSums(origins[0]) for model in evaluated_models}
     errors: dict[str, list[PredictionErrors]] = {model.name: [] for model in evaluated_models}
     true, copies = LatentSums(origins[0]), LatentSums(origins[0])
     actions, names = list[np.ndarray](), list[ClipName]()
-    starts, moves = list[RolloutStart](), list[RolloutStart]()
-    probed = {clips.names[index] for index in spread_indices(len(clips.names), probes.ranking_clips)}
+    transitions, moves = list[Transition](), list[Transition]()
+    ranking_clips = {clips.names[index] for index in spread_indices(len(clips.names), probes.ranking_clips)}
 
-    def add(ids: Sequence[str], name: str, actions: ActionMode, mode: Mode, latents: torch.Tensor) -> None:
+    def add_rollout(ids: Sequence[str], name: str, actions: ActionMode, mode: Mode, latents: torch.Tensor) -> None:
         if (actions, mode) == ("true", "rollout"):
             predicted[name].add(latents, ids)
 
-    for batch, shuffled_actions in itertools.chain(first, batches):
+    for batch, shuffled_actions in itertools.chain(first_batch, batches):
         true.add(batch.latents[:, 1:], batch.episode_ids)
         copies.add(batch.latents[:, :1].expand_as(batch.latents[:, 1:]), batch.episode_ids)
         for evaluated_model in evaluated_models:
-            on_prediction = partial(add, batch.episode_ids, evaluated_model.name)
+            on_prediction = partial(add_rollout, batch.episode_ids, evaluated_model.name)
             with evaluated_model.prediction_context():
                 errors[evaluated_model.name].append(
                     measure_errors(
@@ -189,9 +190,9 @@ def _collect(
                 )
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
             names.append(name)
-            if name in probed:
-                largest = int(batch.actions[row][:, clips.space.size_axes].norm(dim=-1).argmax())
-                starts.append(rollout_start(batch, row, largest))
+            if name in ranking_clips:
+                largest_step = int(batch.actions[row][:, clips.space.size_axes].norm(dim=-1).argmax())
+                transitions.append(make_transition(batch, row, largest_step))
                 moves += select_moves(batch, row, clips.space, probes.reach_cm / 100)
         actions.append(batch.actions.cpu().numpy().astype(np.float64))
         progress(len(names), len(clips.names))
@@ -203,8 +204,8 @@ def _collect(
         copies=LatentSums.joined(gather_shared([copies])),
         actions=np.concatenate(gather_shared(actions)),
         names=names,
-        starts=gather_starts(starts, clips.device),
-        moves=gather_starts(moves, clips.device),
+        transitions=gather_transitions(transitions, clips.device),
+        moves=gather_transitions(moves, clips.device),
     )
 
 
@@ -212,15 +213,15 @@ def _collect(
 def _examples(
     evaluated_models: Sequence[EvaluatedModel],
     clips: RepeatableClips,
-    known: Clips,
+    clips_info: Clips,
     errors: PredictionErrors,
-    count: int,
+    max_examples: int,
 ) -> tuple[Example, ...]:
     """Choose the example clips by their errors, and read them again with their frames."""
-    chosen = select_example_clips(errors, known.action_size.sum(axis=1), count)
+    chosen = select_example_clips(errors, clips_info.action_size.sum(axis=1), max_examples)
     if not chosen:
         return ()
-    reasons = {(known.episode_ids[clip], known.starts[clip]): why for clip, why in chosen.items()}
+    reasons = {(clips_info.episode_ids[clip], clips_info.starts[clip]): why for clip, why in chosen.items()}
     examples = {}
     for batch, frames_of_row in clips.read(list(reasons)):
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
@@ -231,25 +232,26 @@ def _examples(
                     predicted[evaluated_model.name] = (
                         predict_frames(evaluated_model.model, batch.select_clip(row))[0].float().cpu()
                     )
-            errors_of = {
+            patch_errors = {
                 source: rearrange(
-                    absolute_difference(values, true[1:]).mean(dim=-1),
+                    absolute_difference(latents, true[1:]).mean(dim=-1),
                     "horizon (h w) -> horizon h w",
                     h=math.isqrt(true.shape[1]),
                 ).numpy()
-                for source, values in predicted.items()
+                for source, latents in predicted.items()
             }
-            examples[name] = Example(reasons[name], *name, frames_of_row(row), errors_of)
+            examples[name] = Example(reasons[name], *name, frames_of_row(row), patch_errors)
     return tuple(examples[name] for name in reasons if name in examples)
 
 
 # ---- the clips ----
 
-# A step is idle if all three values are below these limits.
-SPEED_CM_S = 2.0  # speed of the flange
-TURN_DEGREES_S = 10.0  # angular speed of the flange
-GRIP = 0.05  # change of the gripper's closedness in a model step
-_IDLE_SHARE = 0.1  # for actions that are not poses: limit of the norm, as a share of its 95th percentile
+# A step with a change of the pose is idle if the speed of the flange, its angular speed and the change of the gripper's
+# closedness are all below these limits.
+SPEED_CM_S = 2.0
+TURN_DEGREES_S = 10.0
+GRIP = 0.05  # in a model step
+_IDLE_SHARE = 0.1  # a vector is idle if its norm is below this fraction of the 95th percentile of all norms
 
 
 def describe_clips(
@@ -259,7 +261,7 @@ def describe_clips(
     space: ActionSpace,
     seconds_per_step: float,
 ) -> Clips:
-    """Return the clips with the size of their actions, and which of their steps are moving.
+    """Return the clips with the size of the action at each step, and whether the robot moves in it.
 
     Args:
         actions: The actions of all clips.
@@ -269,37 +271,39 @@ def describe_clips(
     """
     size, (episode_ids, starts) = space.compute_display_size(actions), zip(*names, strict=True)
     if space.position is None or space.rotation is None or space.gripper is None:
-        least = _IDLE_SHARE * float(np.percentile(size, 95))
-        words = f"the norm of the action is {least:.3g} or more, a tenth of its 95th percentile"
-        return Clips(episode_ids, starts, size, size >= max(least, np.finfo(float).tiny), words)
-    moves = size >= SPEED_CM_S * seconds_per_step
+        min_norm = _IDLE_SHARE * float(np.percentile(size, 95))
+        rule = f"the norm of the action is {min_norm:.3g} or more, a tenth of the 95th percentile of all norms"
+        return Clips(episode_ids, starts, size, size >= max(min_norm, np.finfo(float).tiny), rule)
+    is_translating = size >= SPEED_CM_S * seconds_per_step
     traces = np.trace(matrices_from_euler(actions[..., space.rotation]), axis1=-2, axis2=-1)
-    turned = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0)))
-    turns = turned >= TURN_DEGREES_S * seconds_per_step
-    grips = np.abs(actions[..., space.gripper]) >= GRIP
-    words = (
+    angles_degrees = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0)))
+    is_rotating = angles_degrees >= TURN_DEGREES_S * seconds_per_step
+    is_gripping = np.abs(actions[..., space.gripper]) >= GRIP
+    rule = (
         f"the flange moves at {SPEED_CM_S:g} cm/s or more, or turns at {TURN_DEGREES_S:g} degrees/s or more, or the"
         f" gripper opens or closes by {GRIP:.0%} or more in the step"
     )
-    return Clips(episode_ids, starts, size, moves | turns | grips, words)
+    return Clips(episode_ids, starts, size, is_translating | is_rotating | is_gripping, rule)
 
 
-def select_example_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], count: int) -> dict[int, str]:
-    """Return the indices of the clips to show, with the reasons: most motion; best, worst and median relative error.
+def select_example_clips(
+    errors: PredictionErrors, distances: Float[np.ndarray, " clips"], max_clips: int
+) -> dict[int, str]:
+    """Return the indices of the clips to show, each with the reason: most motion, or best, worst or median error.
 
-    The relative error is the L1 error divided by that of persistence.
+    The errors are relative to persistence.
 
     Args:
         errors: Errors of the trained model.
-        moved: Distance that the robot moves in each clip.
-        count: Largest number of clips.
+        distances: Distance that the robot moves in each clip.
+        max_clips: Maximum number of clips.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         trained, persistence = (errors.of("rollout", L1, actions).mean(axis=1) for actions in ("true", "persistence"))
         ratios = trained / persistence
     order = np.argsort(np.nan_to_num(ratios, nan=np.inf, posinf=np.inf), kind="stable")
     clips_by_reason = {
-        "most motion": int(np.argmax(moved)),
+        "most motion": int(np.argmax(distances)),
         "best": int(order[0]),
         "worst": int(order[-1]),
         "median": int(order[len(order) // 2]),
@@ -307,4 +311,4 @@ def select_example_clips(errors: PredictionErrors, moved: Float[np.ndarray, " cl
     chosen: dict[int, str] = {}
     for why, clip in clips_by_reason.items():
         chosen[clip] = f"{chosen[clip]}, {why}" if clip in chosen else why
-    return dict(list(chosen.items())[:count])
+    return dict(list(chosen.items())[:max_clips])

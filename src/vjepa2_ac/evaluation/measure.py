@@ -1,7 +1,7 @@
-"""Measurement of predictions: errors between predicted and true latents, and the errors of persistence.
+"""Measure predictions: errors between predicted and true latents, and the errors of persistence.
 
 All errors compare layer-normalised latents, per clip and model step. *Persistence* copies the last given frame. A
-relative error of 1 is as good as persistence; 0 is perfect.
+relative error of 1 is as good as persistence, and 0 is perfect.
 """
 
 from __future__ import annotations
@@ -24,15 +24,14 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import L1, MODES, ActionMode, Metric, Mode, PredictionErrors
 
 _Window = TypeVar("_Window")
-VALIDATION_PREDICTIONS: tuple[
-    tuple[ActionMode, Mode], ...
-] = (  # rollouts take longest, so they are made with the true actions only
+# Rollouts take longest, so they are made with the true actions only.
+VALIDATION_PREDICTIONS: tuple[tuple[ActionMode, Mode], ...] = (
     *(("true", mode) for mode in MODES),
     *(("persistence", mode) for mode in MODES),
     ("zero", "teacher_forced"),
     ("shuffled", "teacher_forced"),
 )
-_MOST_FRAMES = 8  # frames of a clip: as in the training of the released weights, and short enough for large strides
+_MAX_FRAMES = 8  # of a clip: as in the training of the released weights, and short enough for large strides
 ONE_STEP_PREDICTIONS: tuple[tuple[ActionMode, Mode], ...] = (
     ("true", "teacher_forced"),
     ("persistence", "teacher_forced"),
@@ -61,13 +60,13 @@ class ClipSample:
     """Options of a sample of held-out clips."""
 
     split: Split = "validation"
-    clips: int = 64  # largest number of clips
+    clips: int = 64  # maximum number of clips
     batch_size: int = 8
     strides: tuple[int, ...] = ()  # strides of a calibration; empty: `windows.candidate_strides`
 
-    def frames_of(self, config: DataConfig) -> int:
-        """Return the number of frames of a clip: that of the data, but at most 8."""
-        return min(config.frames, _MOST_FRAMES)
+    def num_frames(self, config: DataConfig) -> int:
+        """Return the number of frames of a clip: `data.frames`, but at most 8."""
+        return min(config.frames, _MAX_FRAMES)
 
 
 @torch.no_grad()
@@ -84,7 +83,7 @@ def measure_errors(
     Args:
         model: The predictor.
         batch: The clips.
-        predictions: The predictions to make.
+        predictions: The actions and the mode of each prediction.
         metrics: The metrics of the errors.
         shuffled_actions: The actions of other clips, required for predictions with shuffled actions.
         on_prediction: Called with each prediction, since predictions are not stored.
@@ -124,9 +123,10 @@ def prediction_errors(
     metrics: Sequence[Metric] = (L1,),
     before: Float[Tensor, "1 time action_dim"] | None = None,
 ) -> PredictionErrors:
-    """Measure a model with the predictions of a validation, batch by batch, so that no latents are stored.
+    """Return the errors of a validation. The batches are measured one by one, and no latents are stored.
 
-    If several processes share the work, each passes its batches, and `before` as for `with_shuffled_actions`.
+    If several processes share the work, each process passes its own batches, and `before` as in
+    `with_shuffled_actions`.
     """
     pairs = with_shuffled_actions(batches, before)
     return concatenate_errors(
@@ -142,21 +142,21 @@ def prediction_errors(
 def previous_clip_actions(
     indices: range, windows: Sequence[_Window], read: Callable[[list[_Window]], Iterator[Batch]]
 ) -> Float[Tensor, "1 time action_dim"] | None:
-    """Return the actions of the clip before this process's first clip, which are the first clip's shuffled actions.
+    """Return the shuffled actions of this process's first clip: the actions of the clip before it.
 
-    None: this process has the first clip of all, or no clips.
+    Return None if the process has all clips, or no clips.
 
     Args:
-        indices: The indices of this process's clips.
+        indices: Indices of this process's clips.
         windows: The windows of all clips.
-        read: Reads the clips of windows; broken clips are left out.
+        read: Reads the clips at some windows; broken clips are left out.
     """
     if len(indices) in (0, len(windows)):
         return None
-    before = (batch.actions for window in reversed(windows[: indices.start]) for batch in read([window]))
-    if (nearest := next(before, None)) is not None:
-        return nearest
-    # No clip before this part can be read: use the second readable clip, as a single process does for its first clip.
+    earlier = (batch.actions for window in reversed(windows[: indices.start]) for batch in read([window]))
+    if (previous := next(earlier, None)) is not None:
+        return previous
+    # No earlier clip can be read: use the second readable clip, as a single process does for its first clip.
     readable = (batch.actions for window in windows for batch in read([window]))
     return next(islice(readable, 1, None), None)
 
@@ -164,18 +164,18 @@ def previous_clip_actions(
 def with_shuffled_actions(
     batches: Iterable[LatentBatch], before: Float[Tensor, "1 time action_dim"] | None = None
 ) -> Iterator[tuple[LatentBatch, Float[Tensor, "batch time action_dim"]]]:
-    """Yield each batch with the shuffled actions of its clips: those of the previous clip, for any batch size.
+    """Yield each batch with shuffled actions: each clip gets the actions of the previous clip, for any batch size.
 
-    The first clip gets `before` if another process has the clips before it, otherwise the actions of the second clip;
-    a single clip gets its own actions in reverse order.
+    The first clip gets `before`. Without it, the first clip gets the actions of the second clip, and a single clip gets
+    its own actions in reverse order.
     """
-    rest = iter(batches)
-    head = list(islice(rest, 1))
-    if before is None and head:
-        head += islice(rest, 1 if len(head[0].actions) == 1 else 0)
-        known = torch.cat([batch.actions for batch in head])
-        before = known[1:2] if len(known) > 1 else known.flip(1)
-    for batch in chain(head, rest):
+    remaining = iter(batches)
+    first = list(islice(remaining, 1))
+    if before is None and first:
+        first += islice(remaining, 1 if len(first[0].actions) == 1 else 0)  # a second clip is needed
+        actions = torch.cat([batch.actions for batch in first])
+        before = actions[1:2] if len(actions) > 1 else actions.flip(1)
+    for batch in chain(first, remaining):
         assert before is not None  # noqa: S101  # there is a first batch
         yield batch, torch.cat([before.to(batch.actions), batch.actions[:-1]])
         before = batch.actions[-1:]
@@ -190,14 +190,14 @@ def predict_frames(
 ) -> Float[Tensor, "batch horizon tokens dim"]:
     """Return the predictions of all frames after the first.
 
-    The states are the true ones for all actions, and can reveal the motion. The increase of the error with zero or
-    shuffled actions is therefore a lower bound.
+    The model receives the true states with all actions, and these can reveal the motion. The increase of the error with
+    zero or shuffled actions is therefore a lower bound of the model's sensitivity to actions.
     """
     context = batch.latents[:, :1] if mode == "rollout" else batch.latents[:, :-1]
     if actions == "persistence":
         return context.expand_as(batch.latents[:, 1:])
-    action_tensors = {"true": batch.actions, "zero": torch.zeros_like(batch.actions)}
-    action_tensors |= {} if shuffled_actions is None else {"shuffled": shuffled_actions}
+    actions_by_mode = {"true": batch.actions, "zero": torch.zeros_like(batch.actions)}
+    actions_by_mode |= {} if shuffled_actions is None else {"shuffled": shuffled_actions}
     extrinsics = None if batch.extrinsics is None else batch.extrinsics[:, :-1]
     predict = model.rollout if mode == "rollout" else model.predict
-    return predict(context, action_tensors[actions], batch.states[:, :-1], extrinsics)
+    return predict(context, actions_by_mode[actions], batch.states[:, :-1], extrinsics)

@@ -1,4 +1,4 @@
-"""Options of an evaluation, and the config for them. PyTorch is not imported."""
+"""Options of an evaluation, and the config that results from them. PyTorch is not imported."""
 
 from __future__ import annotations
 
@@ -22,10 +22,12 @@ class ProbeOptions:
     """Options of action ranking, energy landscapes and examples; with 0 clips a measurement is skipped."""
 
     ranking_clips: int = 32
-    samples: int = 64  # alternative actions per move, of each of two types (box and shell)
+    samples: int = 64  # alternative actions per move from the box, and the same number from the shell
     landscape_clips: int = 8
     nodes: int = 9  # grid points along each axis of a landscape
-    reach_cm: float = 7.5  # half-width of landscapes and of the box along each axis, as in upstream's notebook
+    reach_cm: float = (
+        7.5  # half-width of the box and of landscapes, and maximum length of moves; as in upstream's notebook
+    )
     examples: int = 4
     at_once: int = 64  # samples per batch
 
@@ -35,27 +37,29 @@ class EvaluationOptions:
     """The options of an evaluation."""
 
     split: Split = "test"
-    clips: int = 256  # largest number of clips, spread over the episodes
-    checkpoint: str = SELECTED  # for a run: selected, newest, best, or a number of optimizer steps
+    clips: int = 256  # maximum number of clips, spread over the episodes
+    checkpoint: str = SELECTED  # checkpoint of a run: selected, newest, best, or a number of optimizer steps
     data: Config | None = None  # config of the data; None: the data of the run. Required for a model
-    against: Sequence[str] | None = None  # "base", runs, models; None: the base model of a run, nothing for a model
+    # Models to compare with: "base", runs, models. None: the base model of a run; a model is not compared.
+    against: Sequence[str] | None = None
     out: Path | None = None  # output folder; None: the folder of the run
     probes: ProbeOptions = field(default_factory=ProbeOptions)
     decoder: str | None = None  # folder of a decoder, or builtin:sim-tiny; with it, decoded rollouts are measured
-    overrides: Sequence[str] = ()  # of the config: planning.…, and model.base=PATH for a run whose base model was moved
+    # Overrides of the config: keys of planning, and model.base=PATH for a run whose base model was moved.
+    overrides: Sequence[str] = ()
 
 
 def resolve_config(subject: str, options: EvaluationOptions) -> Config:
     """Return the config for an evaluation, with the overrides applied.
 
     Args:
-        subject: The folder of a run; or a model, as in `model.base`.
+        subject: The folder of a run, or a model as in `model.base`.
         options: The options.
 
     Raises:
-        InputError: The subject is not a run and there are no data, a setting is invalid, or a folder is missing.
+        InputError: A model has no data, an override is invalid, or a folder or a checkpoint is missing.
     """
-    config = _config_of(subject, options)
+    config = _select_config(subject, options)
     for override in options.overrides:
         if not (override.startswith("planning.") or (is_run(subject) and sets_movable_path(override))):
             needed = "keys of planning, such as planning.samples=200; or, for a run, model.base=PATH"
@@ -68,25 +72,25 @@ def resolve_config(subject: str, options: EvaluationOptions) -> Config:
 
 
 def _require_checkpoint(run: Path, checkpoint: str) -> None:
-    """Check that a requested step exists, before a model is loaded. The files are verified when they are loaded."""
+    """Check that the checkpoint of a requested step exists. Its files are verified when they are loaded."""
     if checkpoint.isdecimal() and not (run / CHECKPOINTS / checkpoint_name(int(checkpoint))).is_dir():
         select_checkpoint(run, checkpoint)  # raises, and lists the existing steps
 
 
 def require_single_process(environment: Mapping[str, str] = os.environ) -> None:
-    """Check that there is one process: several would each do all of the work and write the same files.
+    """Check that there is only one process: several processes would repeat the work and write the same files.
 
     Raises:
         InputError: torchrun or `accelerate launch` started several processes.
     """
-    if (processes := environment.get("WORLD_SIZE", "1")) != "1":
-        needed = "1: only train, encode and evaluate share work between processes"
+    if (num_processes := environment.get("WORLD_SIZE", "1")) != "1":
+        needed = "one process, since only train, encode and evaluate share work between processes"
         fix = "Start the command without torchrun or accelerate launch"
-        raise InputError(where="torchrun", found=counted(int(processes), "process"), needed=needed, fix=fix)
+        raise InputError(where="torchrun", found=counted(int(num_processes), "process"), needed=needed, fix=fix)
 
 
-def _config_of(subject: str, options: EvaluationOptions) -> Config:
-    """Return the config of a run (with other data, if given), or the config of the data for a model."""
+def _select_config(subject: str, options: EvaluationOptions) -> Config:
+    """Return the config of a run, with `options.data` if given. For a model, return the config of the data."""
     run_config = read_run_config(Path(subject)) if is_run(subject) else None
     if options.data is None:
         if run_config is None:
@@ -101,7 +105,7 @@ def _config_of(subject: str, options: EvaluationOptions) -> Config:
             )
         return run_config
     if options.out is None:
-        problem, needed = "no output folder", "--out: metrics.json in a run's folder belongs to the run's own data"
+        problem, needed = "no output folder", "one, since metrics.json in a run's folder is that of the run's own data"
         raise InputError(where="--data without --out", found=problem, needed=needed, fix="Add --out FOLDER")
     require_stride(options.data.data, to="evaluate")
     return options.data if run_config is None else run_config.model_copy(update={"data": options.data.data})

@@ -1,7 +1,7 @@
 """Evaluation results: arrays by clip, and estimates with intervals computed from them. PyTorch is not imported.
 
-Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). All errors compare
-layer-normalised latents, with all registered metrics. Estimates that compare two models are paired by clip.
+The clip axis of every array has the same order. The horizon axis is 1 .. H model steps ahead: index h - 1, with H =
+frames - 1. All errors compare layer-normalised latents. Estimates that compare two models are paired by clip.
 `evaluation.rows` makes the rows of the tables, `evaluation.summary` the summary.
 """
 
@@ -22,13 +22,13 @@ from vjepa2_ac.registry import METRICS
 if TYPE_CHECKING:
     from torch import Tensor
 
-SAME_ENERGY = 1e-6  # energies with a smaller relative difference count as equal, so that rounding decides no rank
-PERSISTENCE = "persistence"  # name in the column of models: a copy of frame 0
+SAME_ENERGY = 1e-6  # energies with a smaller relative difference count as equal, because it may be rounding
+PERSISTENCE = "persistence"  # its name where models are listed
 
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric of predictions with positive values, which are shown relative to persistence."""
+    """A metric of predictions. Its values are positive, and are shown relative to the value of persistence."""
 
     name: str  # in metrics.json
     label: str  # in tables and sentences
@@ -56,7 +56,7 @@ def registered_metrics() -> tuple[Metric, ...]:
 
 Mode = Literal["teacher_forced", "rollout"]
 Actions = Literal["true", "zero", "shuffled"]
-ActionMode = Literal["true", "zero", "shuffled", "persistence"]  # actions of a prediction, or a copy of the given frame
+ActionMode = Literal["true", "zero", "shuffled", "persistence"]  # actions of a prediction; persistence predicts a copy
 Role = Literal["base", "trained", "other"]
 
 MODES: tuple[Mode, ...] = ("teacher_forced", "rollout")
@@ -80,12 +80,12 @@ class About:
     seed: int
     version: str  # of this package
     time: str  # UTC
-    is_base: bool = False  # the checkpoint has the weights of the base model
+    is_base: bool = False  # whether the checkpoint has the weights of the base model
 
 
 @dataclass(frozen=True)
 class Clips:
-    """The clips, and the size of their actions."""
+    """The clips of an evaluation, and the size of their actions."""
 
     episode_ids: tuple[str, ...]
     starts: tuple[int, ...]  # first control step of each clip
@@ -104,7 +104,7 @@ class Clips:
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """The errors of one model and of persistence on the same clips; row i of every array is clip i.
+    """The errors of one model and of persistence on the same clips. Row i of every array belongs to clip i.
 
     Teacher forcing: frame h is predicted from the true frames before it. Rollout: all frames are predicted from frame 0
     alone. Persistence copies frame h - 1 with teacher forcing, and frame 0 in a rollout. At horizon 1 both modes are
@@ -112,9 +112,8 @@ class PredictionErrors:
     """
 
     episode_ids: tuple[str, ...]
-    arrays: Mapping[
-        tuple[ActionMode, Mode, str], Float[np.ndarray, "clips horizon"]
-    ]  # key: actions, mode, name of the metric
+    # Key: actions, mode, name of the metric.
+    arrays: Mapping[tuple[ActionMode, Mode, str], Float[np.ndarray, "clips horizon"]]
 
     def of(self, mode: Mode, metric: Metric = L1, actions: ActionMode = "true") -> Float[np.ndarray, "clips horizon"]:
         """Return the errors for a mode, a metric, and the actions of the prediction."""
@@ -125,19 +124,21 @@ class PredictionErrors:
 class ActionRanking:
     """The action-ranking error: the fraction of alternative actions with a lower energy than the true action.
 
-    It is measured on moves (`action_use.select_moves`) as large as planned actions, forwards and backwards in time.
-    Chance is 0.5; a perfect model has 0. The errors of two models on the same moves can be compared in pairs.
+    It is measured on moves as large as planned actions (`action_use.select_moves`), forwards and backwards in time.
+    Chance is 0.5, and a perfect model has 0. Two models on the same moves are compared in pairs.
     """
 
-    samples: int  # alternatives per move in the box, and the same number on the shell
-    reach: float  # half the width of the box along each of x, y, z, in metres
+    samples: int  # alternatives per move from the box, and the same number from the shell
+    reach: float  # half-width of the box along each of x, y, z, in metres
     episode_ids: tuple[str, ...]  # episode of each move
     ranks: Float[np.ndarray, " moves"]  # error of each move: mean of box and shell
     rank: Estimate  # mean of `ranks`
-    box: Estimate  # error among actions that are uniform in the box
-    shell: Estimate  # error among actions as long as the true action in random directions: sensitivity to direction
+    box: Estimate  # error for alternatives from the box (`action_use.draw_alternatives`)
+    shell: Estimate  # error for alternatives from the shell, which measures the sensitivity to direction
     spread: Estimate  # standard deviation of the energy in the box, relative to persistence's error; 0: flat
-    change: Estimate  # change of the prediction with actions in the box, likewise relative; 0: actions are ignored
+    change: (
+        Estimate  # change of the prediction with the action, relative to persistence's error; 0: actions are ignored
+    )
 
 
 @dataclass(frozen=True)
@@ -150,15 +151,15 @@ class Validation:
 
 @dataclass(frozen=True)
 class Landscape:
-    """The L1 energy of one step of a clip over a grid of (dx, dy, dz); the rest of the action is the true one.
+    """The L1 energy of one step of a clip, over a grid of the action's first three components.
 
-    The grid is approximately centred at *zero* and has a node exactly at the true action, so that a minimum at the true
-    action is not an artefact of the grid's centre.
+    The other components are those of the true action. The grid is approximately centred at zero and has a node exactly
+    at the true action: a minimum at the true action is therefore not an artefact of the grid's centre.
     """
 
     episode_id: str
-    start: int
-    axes: Float[np.ndarray, "3 grid"]  # the evaluated actions along each axis, ascending; cm, or plain numbers
+    start: int  # first control step of the clip
+    axes: Float[np.ndarray, "3 grid"]  # values of each component, ascending; positions in cm
     energy: Float[np.ndarray, "grid grid grid"]  # indices: first, second, third axis
     true: Float[np.ndarray, " 3"]
     minimum: Float[np.ndarray, " 3"]  # node with the lowest energy; the mean of several such nodes
@@ -171,11 +172,11 @@ class Landscape:
     @property
     def rank(self) -> float:
         """Fraction of the other nodes whose energy is below that of the true action; equal energies count half."""
-        node = tuple(np.abs(self.axes - self.true[:, None]).argmin(axis=1))
-        difference = self.energy - self.energy[node]
-        is_equal = np.abs(difference) <= SAME_ENERGY * abs(self.energy[node])
-        below = (difference < 0) & ~is_equal
-        return float((below.sum() + (is_equal.sum() - 1) / 2) / (self.energy.size - 1))
+        true_node = tuple(np.abs(self.axes - self.true[:, None]).argmin(axis=1))
+        difference = self.energy - self.energy[true_node]
+        is_equal = np.abs(difference) <= SAME_ENERGY * abs(self.energy[true_node])
+        is_below = (difference < 0) & ~is_equal
+        return float((is_below.sum() + (is_equal.sum() - 1) / 2) / (self.energy.size - 1))
 
     @property
     def sharpness(self) -> float:
@@ -205,7 +206,7 @@ class Landscapes:
         return estimate_mean(self._values(measure), self.episode_ids)
 
     def difference(self, other: Landscapes, measure: LandscapeMeasure) -> Estimate:
-        """Return the mean of a measure minus that of another model on the same clips, paired."""
+        """Return the mean difference of a measure from that of another model on the same clips."""
         return estimate_mean(self._values(measure) - other._values(measure), self.episode_ids)
 
     def _values(self, measure: LandscapeMeasure) -> Float[np.ndarray, " clips"]:
@@ -216,12 +217,12 @@ class Landscapes:
 class LatentDistribution:
     """Comparison of the distributions of predicted and true latents over clips (see `evaluation.distribution`).
 
-    All values are by horizon (index h - 1), except `fvd`, which uses one feature vector for each clip.
+    Each tuple has one value per horizon (index h - 1).
     """
 
     spread: tuple[Estimate, ...]  # 1: as varied as the true latents
     mmd: tuple[Estimate, ...]  # squared, times 100; unbiased; no interval from one episode
-    fvd: float  # Fréchet distance; biased upwards, more so with fewer clips
+    fvd: float  # Fréchet distance with one feature vector per clip; biased upwards, more so with fewer clips
     variance: tuple[float, ...]  # trace of the covariance of the predicted latents over clips
     true_variance: tuple[float, ...]  # trace of the covariance of the true latents; `spread` is the ratio
 
@@ -230,9 +231,9 @@ class LatentDistribution:
 class DecodedStrip:
     """The images of one example clip."""
 
-    why: str
+    why: str  # reason of the choice, as in `Example`
     episode_id: str
-    start: int
+    start: int  # first control step of the clip
     # truth, decoded_truth, base, adapter -> images; the first image of a row is frame 0, which is not predicted
     rows: Mapping[str, UInt8[np.ndarray, "time size size 3"]]
 
@@ -241,9 +242,9 @@ class DecodedStrip:
 class DecodedRollouts:
     """Metrics of decoded rollouts. Frame 0 is given, so horizons begin at 1.
 
-    A *source* is a model's rollout with the true actions, or one of three baselines: decoded truth (the upper bound of
-    the decoder), decoded persistence, and raw persistence. The latter copies the pixels of frame 0 and has a better
-    PSNR than any decoder if little moves.
+    A *source* is a model's rollout with the true actions, or one of three baselines: decoded truth (the best result
+    that the decoder can reach), decoded persistence, and raw persistence. Raw persistence copies the pixels of frame 0.
+    If little moves, it has a better PSNR than any decoder.
     """
 
     decoder: Mapping[str, Any]  # description of the decoder: folder, size, encoder, data, frames, steps, held_out
@@ -251,7 +252,7 @@ class DecodedRollouts:
     curves: Mapping[tuple[str, str], tuple[Estimate, ...]]  # key: source, metric such as psnr_db.moving.truth
     strips: tuple[DecodedStrip, ...] = ()
     notes: tuple[str, ...] = ()  # missing measurements with reasons; numbers of clips that were left out
-    # By source: Fréchet distance of the re-encoded images to the true latents; empty: the encoder was not loaded.
+    # By source: Fréchet distance between re-encoded images and true latents. Empty: the encoder was not loaded.
     fvd: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -273,14 +274,14 @@ class Example:
 
     why: str  # reason of the choice: best, worst, median, most motion
     episode_id: str
-    start: int
+    start: int  # first control step of the clip
     frames: UInt8[np.ndarray, "time height width 3"] | None  # the encoder's input; None for cached latents
     errors: Mapping[str, Float[np.ndarray, "horizon grid grid"]]  # model or persistence -> L1 error of each patch
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All results of an evaluation; models are in the order of the table: base, others, the trained model last."""
+    """All results of an evaluation. The models are in the order of the table: base, others, the trained model last."""
 
     about: About
     clips: Clips
@@ -288,7 +289,7 @@ class Evaluation:
     examples: tuple[Example, ...] = ()
     notes: tuple[str, ...] = ()  # notes for the user, such as why there is no base model or no landscape
     metrics: tuple[Metric, ...] = (L1, L2)  # metrics of the errors
-    copies: LatentDistribution | None = None  # distribution for copies of frame 0 (persistence)
+    copies: LatentDistribution | None = None  # distribution of copies of frame 0 (persistence)
     fvd_of_halves: float = math.nan  # Fréchet distance between two halves of the true clips: the value by chance
     decoded: DecodedRollouts | None = None  # None: no decoder was used
 
@@ -311,7 +312,7 @@ class Evaluation:
 
     @property
     def ranked(self) -> str | None:
-        """Description of the action ranking; equal for comparable evaluations. None: actions were not ranked."""
+        """Settings of the action ranking as text, equal for comparable evaluations. None: actions were not ranked."""
         ranking = self.models[self.trained].ranking
         if ranking is None:
             return None
@@ -341,14 +342,14 @@ Steps = Bool[np.ndarray, "clips horizon"]  # True for steps to include
 
 
 def over_persistence(errors: PredictionErrors, mode: Mode, metric: Metric = L1, actions: ActionMode = "true") -> Curve:
-    """Return the mean error relative to persistence's at each horizon: 1 is as good as persistence; 0 is perfect."""
+    """Return the mean error relative to that of persistence at each horizon: 1 is as good as persistence, 0 perfect."""
     return estimate_ratios(errors.of(mode, metric, actions), errors.of(mode, metric, "persistence"), errors.episode_ids)
 
 
 def one_step_over_persistence(
     errors: PredictionErrors, actions: Actions = "true", steps: Steps | None = None
 ) -> Estimate:
-    """Return the teacher-forced error relative to persistence, over all or the selected steps; NaN without steps."""
+    """Return the teacher-forced error relative to persistence, over some steps (None: all); NaN without steps."""
     return estimate_ratio(
         _one_step(errors, actions, steps), _one_step(errors, "persistence", steps), errors.episode_ids
     )
@@ -359,18 +360,18 @@ def gain_over(
 ) -> Curve:
     """Return the relative gain over another model at each horizon, paired by clip: 0.18 is 18 % better."""
     pair = [each.of(mode, metric) for each in (errors, reference)]
-    better = 1 if metric.smaller_is_better else -1
-    return bootstrap(lambda sums: better * (1 - sums[0] / sums[1]), np.stack(pair), errors.episode_ids)
+    sign = 1 if metric.smaller_is_better else -1
+    return bootstrap(lambda sums: sign * (1 - sums[0] / sums[1]), np.stack(pair), errors.episode_ids)
 
 
 def cost_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
     """Return the relative increase of the teacher-forced error with zero or shuffled actions, paired by clip."""
-    grown = estimate_ratio(_one_step(errors, actions), _one_step(errors, "true"), errors.episode_ids)
-    return Estimate(grown.value - 1, grown.low - 1, grown.high - 1)
+    ratio = estimate_ratio(_one_step(errors, actions), _one_step(errors, "true"), errors.episode_ids)
+    return Estimate(ratio.value - 1, ratio.low - 1, ratio.high - 1)
 
 
 def gap_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
-    """Return the increase of the teacher-forced error with zero or shuffled actions, relative to persistence."""
+    """Return the increase of the teacher-forced error with zero or shuffled actions, divided by persistence's error."""
     changed, true = (errors.of("teacher_forced", L1, each) for each in (actions, "true"))
     return estimate_ratio((changed - true).mean(axis=1), _one_step(errors, "persistence"), errors.episode_ids)
 

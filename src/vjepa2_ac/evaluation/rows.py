@@ -41,20 +41,20 @@ _GAIN: dict[str, Any] = {"form": ".1%", "better": "higher", "chance": 0.0}
 
 @dataclass(frozen=True)
 class Row:
-    """One number of an evaluation, in one cell of a table."""
+    """One number of an evaluation with its interval, for one cell of a table."""
 
     group: str  # title of the table
     name: str  # label of the line
-    key: str  # identifies table and line in metrics.json, such as rollout.l1.over_persistence.3
-    model: str  # column: a model, or persistence
+    key: str  # identifies the table and the line in metrics.json, such as rollout.l1.over_persistence.3
+    model: str  # column of the table: the name of a model, or persistence
     value: _Number  # NaN: not measured
     low: _Number = math.nan  # 95 % interval over episodes; NaN: there is none
     high: _Number = math.nan
-    form: str = ".3f"
+    form: str = ".3f"  # format of the value
     better: Literal["lower", "higher", ""] = "lower"
     chance: float | None = None  # value of persistence, or of a model that ignores its actions
     unit: str = ""  # unit of the value, such as cm
-    detail: bool = False  # left out on the console
+    detail: bool = False  # whether the console leaves the row out
 
     @property
     def estimate(self) -> Estimate:
@@ -72,21 +72,21 @@ class RowTable:
     title: str
     columns: tuple[str, ...]
     better: tuple[str, ...]  # direction of each line: "lower", "higher", or "" if neither is better
-    lines: tuple[tuple[str, str, tuple[str, ...]], ...]  # label, value by chance or of persistence, cells by column
+    lines: tuple[tuple[str, str, tuple[str, ...]], ...]  # label, value of persistence or of chance, cell of each column
 
 
 def arrange_tables(rows: Sequence[Row]) -> list[RowTable]:
-    """Arrange rows as tables: rows with the same key form a line, with a column for each model."""
+    """Arrange rows as tables. Rows with the same key form one line, with a column for each model."""
     by_key: dict[str, dict[str, Row]] = {}
     for row in rows:
         by_key.setdefault(row.key, {})[row.model] = row
     groups: dict[str, list[dict[str, Row]]] = {}
     for line in by_key.values():
         groups.setdefault(next(iter(line.values())).group, []).append(line)
-    return [_section(title, lines) for title, lines in groups.items()]
+    return [_make_table(title, lines) for title, lines in groups.items()]
 
 
-def _section(title: str, lines: Sequence[Mapping[str, Row]]) -> RowTable:
+def _make_table(title: str, lines: Sequence[Mapping[str, Row]]) -> RowTable:
     columns = tuple(dict.fromkeys(model for line in lines for model in line if model != PERSISTENCE))
     cells = []
     for line in lines:
@@ -115,7 +115,7 @@ def make_rows(evaluation: Evaluation) -> list[Row]:
 
 
 class _Rows(list[Row]):
-    """A list of rows, with methods that add the rows of each measurement."""
+    """A list of rows, with a method for each measurement that adds its rows."""
 
     def __init__(self, evaluation: Evaluation) -> None:
         super().__init__()
@@ -123,21 +123,21 @@ class _Rows(list[Row]):
         self.errors = {name: model.errors for name, model in evaluation.models.items()}
         self.base = None if evaluation.base is None else evaluation.models[evaluation.base]
 
-    def line(self, group: str, name: str, key: str, values: Mapping[str, Estimate], **style: Any) -> None:
-        """Add a row for each model."""
+    def add_line(self, group: str, name: str, key: str, values: Mapping[str, Estimate], **style: Any) -> None:
+        """Add one line of a table: a row for each model."""
         self.extend(
             Row(group, name, key, model, estimate.value, estimate.low, estimate.high, **style)
             for model, estimate in values.items()
         )
 
-    def curves(
+    def add_curves(
         self, group: str, key: str, curves: Mapping[str, Curve], shown: Collection[int] = (), **style: Any
     ) -> None:
-        """Add the rows of curves by horizon; those not in `shown` are details."""
+        """Add a line for each horizon. Horizons that are not in `shown` are left out on the console."""
         for h in range(1, self.evaluation.horizon + 1):
             values = {model: curve[h - 1] for model, curve in curves.items()}
             name = f"{h * self.evaluation.about.seconds_per_step:.2f} s ahead"
-            self.line(group, name, f"{key}.{h}", values, detail=h not in shown, **style)
+            self.add_line(group, name, f"{key}.{h}", values, detail=h not in shown, **style)
 
     def add_errors(self) -> None:
         """Add the rollout errors relative to persistence, and the gains over the base model, paired by clip."""
@@ -151,7 +151,7 @@ class _Rows(list[Row]):
                 f"rollout.{metric.name}.over_persistence",
             )
             better = "lower" if metric.smaller_is_better else "higher"
-            self.curves(group, key, curves, shown, better=better, chance=1.0)
+            self.add_curves(group, key, curves, shown, better=better, chance=1.0)
         if self.base is None:
             return
         base = self.base.errors
@@ -162,7 +162,7 @@ class _Rows(list[Row]):
                 f"Improvement over the base model in {metric.label}, open loop",
                 f"rollout.{metric.name}.gain_over_base",
             )
-            self.curves(group, key, gains, **_GAIN)
+            self.add_curves(group, key, gains, **_GAIN)
 
     def add_distributions(self) -> None:
         """Add spread, MMD and Fréchet distance of the latents."""
@@ -174,24 +174,24 @@ class _Rows(list[Row]):
             return
         distributions = {PERSISTENCE: evaluation.copies, **models}
         spreads, last = {name: each.spread for name, each in distributions.items()}, {evaluation.horizon}
-        self.curves(
+        self.add_curves(
             "Spread of the predictions relative to the true latents, open loop (ratio, 1: as varied)",
             "spread",
             spreads,
             last,
             better="",
         )
-        sample = f"{counted(len(clips), 'clip')} of {counted(clips.episodes, 'episode')}"
-        group = f"Squared MMD between predicted and true latents x 100, open loop ({sample}; unbiased)"
-        self.curves(group, "latent_mmd", {name: each.mmd for name, each in distributions.items()})
-        of_halves = evaluation.fvd_of_halves
-        halves = f"; two halves of the true clips: {of_halves:.3g}" if math.isfinite(of_halves) else ""
-        group = f"Fréchet distance between predicted and true latents (FVD; {sample}; biased upwards{halves})"
+        sample_size = f"{counted(len(clips), 'clip')} of {counted(clips.episodes, 'episode')}"
+        group = f"Squared MMD between predicted and true latents x 100, open loop ({sample_size}; unbiased)"
+        self.add_curves(group, "latent_mmd", {name: each.mmd for name, each in distributions.items()})
+        by_chance = evaluation.fvd_of_halves
+        halves = f"; two halves of the true clips: {by_chance:.3g}" if math.isfinite(by_chance) else ""
+        group = f"Fréchet distance between predicted and true latents (FVD; {sample_size}; biased upwards{halves})"
         style: dict[str, Any] = {"form": ".3g", "detail": True}
         distances = {name: each.fvd for name, each in distributions.items()}
-        self.line(group, "predicted frames", "fvd.predicted", _without_intervals(distances), **style)
+        self.add_line(group, "predicted frames", "fvd.predicted", _without_intervals(distances), **style)
         if evaluation.decoded is not None and evaluation.decoded.fvd:
-            self.line(group, "decoded frames", "fvd.decoded", _without_intervals(evaluation.decoded.fvd), **style)
+            self.add_line(group, "decoded frames", "fvd.decoded", _without_intervals(evaluation.decoded.fvd), **style)
 
     def add_teacher_forced_rows(self) -> None:
         """Add teacher-forced errors of one step: with zero and shuffled actions, and for moving and idle steps."""
@@ -201,47 +201,49 @@ class _Rows(list[Row]):
         )
         for actions in ACTIONS:
             ratios = {name: one_step_over_persistence(errors, actions) for name, errors in self.errors.items()}
-            self.line(group, f"{actions} actions", f"one_step.{actions}", ratios, chance=1.0)
+            self.add_line(group, f"{actions} actions", f"one_step.{actions}", ratios, chance=1.0)
         for name, steps in (("moving", moving), ("idle", ~moving)):
             if steps.any():
                 ratios = {
                     model: one_step_over_persistence(errors, "true", steps) for model, errors in self.errors.items()
                 }
                 label = f"{name} ({counted(int(steps.sum()), 'step')})"
-                self.line(group, label, f"one_step.{name}", ratios, chance=1.0)
-        grown, gap = (
-            "Increase of the one-step error without the true actions",
-            "The same increase relative to persistence (ratio)",
-        )
+                self.add_line(group, label, f"one_step.{name}", ratios, chance=1.0)
+        increase = "Increase of the one-step error without the true actions"
+        relative_increase = "Increase of the one-step error without the true actions, relative to persistence (ratio)"
         for actions in ACTIONS[1:]:
             name = f"{actions} actions"
             costs = {model: cost_of_actions(errors, actions) for model, errors in self.errors.items()}
-            self.line(grown, name, f"cost_of_actions.{actions}", costs, detail=True, **_GAIN)
+            self.add_line(increase, name, f"cost_of_actions.{actions}", costs, detail=True, **_GAIN)
             gaps = {model: gap_of_actions(errors, actions) for model, errors in self.errors.items()}
-            self.line(gap, name, f"gap_of_actions.{actions}", gaps, detail=True, **(_GAIN | {"form": ".3f"}))
+            self.add_line(
+                relative_increase, name, f"gap_of_actions.{actions}", gaps, detail=True, **(_GAIN | {"form": ".3f"})
+            )
 
     def add_ranking(self, model: str, ranking: ActionRanking) -> None:
-        """Add the action-ranking error, and the changes of prediction and energy with the action."""
-        group = "Action-ranking error: share of alternative actions with a lower energy than the true action"
-        share: dict[str, Any] = {"form": ".1%", "chance": 0.5}
-        self.line(group, "all alternatives", "ranking.rank", {model: ranking.rank}, **share)
-        self.line(group, "alternatives in the box", "ranking.box", {model: ranking.box}, **share)
-        self.line(group, "alternatives as long as the true action", "ranking.shell", {model: ranking.shell}, **share)
+        """Add the action-ranking error, and how much prediction and energy change with the action."""
+        group = "Action-ranking error: fraction of alternative actions with a lower energy than the true action"
+        style: dict[str, Any] = {"form": ".1%", "chance": 0.5}
+        self.add_line(group, "all alternatives", "ranking.rank", {model: ranking.rank}, **style)
+        self.add_line(group, "alternatives from the box", "ranking.box", {model: ranking.box}, **style)
+        self.add_line(
+            group, "alternatives as long as the true action", "ranking.shell", {model: ranking.shell}, **style
+        )
         for key, label, estimate in (
             ("change", "change of the prediction with the action, relative to persistence", ranking.change),
             ("spread", "spread of the energy over actions, relative to persistence", ranking.spread),
         ):
-            self.line(group, label, f"ranking.{key}", {model: estimate}, better="higher", chance=0.0)
+            self.add_line(group, label, f"ranking.{key}", {model: estimate}, better="higher", chance=0.0)
         base = None if self.base is None else self.base.ranking
         if base is not None and base is not ranking:
             label, difference = (
                 "all alternatives, difference from the base model",
                 {model: rank_difference(ranking, base)},
             )
-            self.line(group, label, "ranking.difference_to_base", difference, form="+.1%", chance=0.0, detail=True)
+            self.add_line(group, label, "ranking.difference_to_base", difference, form="+.1%", chance=0.0, detail=True)
 
     def add_landscapes(self, model: str, landscapes: Landscapes) -> None:
-        """Add distance of the energy minimum, rank, sharpness, and their differences from the base model's."""
+        """Add the distance of the energy minimum, the rank, the sharpness, and the differences from the base model."""
         group, unit = f"Energy landscapes of {counted(len(landscapes.maps), 'clip')}", landscapes.unit
         labels: dict[LandscapeMeasure, tuple[str, dict[str, Any]]] = {
             "distance": (
@@ -249,7 +251,7 @@ class _Rows(list[Row]):
                 {"chance": landscapes.chance_distance, "unit": unit},
             ),
             "rank": (
-                "rank: share of grid points with a lower energy than the true action",
+                "rank: fraction of grid points with a lower energy than the true action",
                 {"form": ".1%", "chance": 0.5},
             ),
             "sharpness": ("sharpness: (highest - lowest) / mean energy (ratio)", {"better": "higher", "chance": 0.0}),
@@ -258,27 +260,27 @@ class _Rows(list[Row]):
         for measure in get_args(LandscapeMeasure):
             label, style = labels[measure]
             key, detail = f"landscapes.{measure}", measure == "rank"
-            self.line(group, label, key, {model: landscapes.mean(measure)}, detail=detail, **style)
+            self.add_line(group, label, key, {model: landscapes.mean(measure)}, detail=detail, **style)
             if base is not None and base is not landscapes:
                 difference = {model: landscapes.difference(base, measure)}
                 style = {"form": "+.1%" if measure == "rank" else "+.3f", "better": style.get("better", "lower")}
                 name = f"{measure}, difference from the base model"
-                self.line(group, name, f"{key}.difference_to_base", difference, chance=0.0, detail=True, **style)
+                self.add_line(group, name, f"{key}.difference_to_base", difference, chance=0.0, detail=True, **style)
 
     def add_decoded(self) -> None:
         """Add the metrics of decoded rollouts."""
         if (decoded := self.evaluation.decoded) is None:
             return
         references, measured = ("truth", "decoded_truth"), {metric for _, metric in decoded.curves}
-        main = next(reference for reference in references if f"psnr_db.whole.{reference}" in measured)
-        every = product(references, _SIMILARITIES.items(), _REGIONS.items())
-        for reference, (name, (label, form)), (region, where) in every:
+        shown_reference = next(reference for reference in references if f"psnr_db.whole.{reference}" in measured)
+        combinations = product(references, _SIMILARITIES.items(), _REGIONS.items())
+        for reference, (name, (label, form)), (region, region_label) in combinations:
             metric = f"{name}.{region}.{reference}"
             if metric in measured:
-                group = f"Decoded images compared with the {reference.replace('_', ' ')}: {label}, {where}"
+                group = f"Decoded images compared with the {reference.replace('_', ' ')}: {label}, {region_label}"
                 curves = {source.replace("_", " "): decoded.curves[source, metric] for source in decoded.sources}
-                shown = {self.evaluation.horizon} if reference == main else ()
-                self.curves(group, f"decoded.{metric}", curves, shown, form=form, better="higher")
+                shown = {self.evaluation.horizon} if reference == shown_reference else ()
+                self.add_curves(group, f"decoded.{metric}", curves, shown, form=form, better="higher")
 
 
 def _without_intervals(values: Mapping[str, float]) -> dict[str, Estimate]:

@@ -25,7 +25,7 @@ from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import counted
-from vjepa2_ac.evaluation.action_use import RolloutStart, rollout_start
+from vjepa2_ac.evaluation.action_use import Transition, make_transition
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.inspection.variants import load_named
 from vjepa2_ac.intervals import Estimate, bootstrap, estimate_ratio
@@ -139,7 +139,7 @@ def _wrapped(degrees: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"
 
 @torch.no_grad()
 def infer_axes(
-    model: Predictor, starts: Sequence[RolloutStart], at_once: int, progress: Progress = no_progress
+    model: Predictor, starts: Sequence[Transition], at_once: int, progress: Progress = no_progress
 ) -> AxisFit:
     """Find the angle by which a model's axes are rotated.
 
@@ -163,7 +163,7 @@ def infer_axes(
 
 
 def _errors_by_angle(
-    model: Predictor, start: RolloutStart, centre_m: tuple[float, float], at_once: int
+    model: Predictor, start: Transition, centre_m: tuple[float, float], at_once: int
 ) -> Float[np.ndarray, " angles"]:
     """Return the mean squared error of the next frame at each angle of `TRIED_DEGREES`, with the executed action."""
     turns = [AxesRotation(math.radians(angle), centre_m) for angle in TRIED_DEGREES]
@@ -178,7 +178,7 @@ def _errors_by_angle(
         frames = start.frame.expand(len(states[part]), 1, *start.frame.shape)
         camera = None if cameras is None else cameras[part]
         predicted = model.predict(frames, actions[part], states[part], camera)
-        errors.append(squared_difference(predicted[:, 0], start.following).mean(dim=(1, 2)))
+        errors.append(squared_difference(predicted[:, 0], start.next_frame).mean(dim=(1, 2)))
     return torch.cat(errors).double().cpu().numpy()
 
 
@@ -212,12 +212,12 @@ def calibrate_axes(
     if world_model.adaptation is not None:
         merge_adapter(world_model)
     world_model.to(accelerator.device).eval()
-    starts: list[RolloutStart] = []
+    starts: list[Transition] = []
     encode = partial(encode_batch, world_model, device=accelerator.device)
     with torch.no_grad():
         for batch in validation_batches(dataset, split, clips=pairs, batch_size=config.validation.batch_size):
             latents = encode(batch)
-            starts += [rollout_start(latents, row, 0) for row in range(len(batch.starts))]
+            starts += [make_transition(latents, row, 0) for row in range(len(batch.starts))]
     fit = infer_axes(world_model, starts, config.planning.energy.samples_at_once, reporter.task("rotating the axes"))
     data = config.data
     return fit, {

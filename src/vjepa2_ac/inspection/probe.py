@@ -123,7 +123,7 @@ def probe_variants(
     """
     # Starts of clips of the config's length, because a latent cache contains only these.
     candidates = validation_windows(dataset, sample.split, clips=sample.clips * _CANDIDATES_PER_CLIP)
-    frames = sample.frames_of(dataset.config)
+    frames = sample.num_frames(dataset.config)
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": frames}))
     windows, shifts = _with_room(dataset, candidates, sample.clips)
     variants = [Variant(UNCHANGED, lambda same: same), *variants_of(dataset.config, shifts)]

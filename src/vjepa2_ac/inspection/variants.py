@@ -335,7 +335,7 @@ def calibrate(
     Raises:
         InputError: The split is empty, no stride fits into any of its episodes, or a clip cannot be read.
     """
-    frames, split, rate = sample.frames_of(dataset.config), sample.split, dataset.control_rate_hz
+    frames, split, rate = sample.num_frames(dataset.config), sample.split, dataset.control_rate_hz
     settings = dataset.config.model_copy(update={"frames": frames})
     strides = sample.strides or candidate_strides(rate)
     views = {stride: replace(dataset, config=settings.with_stride(stride)) for stride in strides}

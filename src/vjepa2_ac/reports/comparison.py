@@ -53,7 +53,7 @@ class Comparison:
             gain, step = metrics.of(key), _step(metrics)
             error = self.curves[name][-1].value - 1 if not has_base else -gain.value if gain else 0.0
             checkpoint = "base model" if metrics.about.is_base else "none" if step is None else f"{step:,}"
-            used, rank = _number(metrics.summary.uses_actions), _number(metrics.summary.ranks_actions)
+            used, rank = _number(metrics.summary.sensitivity), _number(metrics.summary.ranking)
             numbers = (_shown(error, "+.1f"), _shown(used, "+.1f"), _shown(rank, ".1f"))
             lines.append(_LINE.format(name if len(name) <= 22 else f"…{name[-21:]}", checkpoint, *numbers))
         title = f"{len(self.measured)} runs on the same {first.summary.measured}, {self.seconds[-1]:.1f} s ahead"
@@ -80,7 +80,7 @@ class Comparison:
         The rule is that of `checkpoint.keep_best`: the lowest action-ranking error; among runs within
         `RANKING_TOLERANCE` of it, the lowest prediction error.
         """
-        ranks = {name: _number(metrics.summary.ranks_actions) for name, metrics in self.measured.items()}
+        ranks = {name: _number(metrics.summary.ranking) for name, metrics in self.measured.items()}
         equal = [name for name, rank in ranks.items() if rank <= min(ranks.values()) + RANKING_TOLERANCE]
         best = min(equal, key=lambda name: self.curves[name][-1].value, default="")
         if len({metrics.ranked for metrics in self.measured.values()}) > 1:
@@ -97,11 +97,11 @@ class Comparison:
     @property
     def _too_few(self) -> str:
         """A sentence that there are too few episodes for a conclusion; empty if there are enough episodes."""
-        return next(iter(self.measured.values())).summary.predicts.needs.partition(" So far: ")[0]
+        return next(iter(self.measured.values())).summary.prediction.needs.partition(" So far: ")[0]
 
     def _objection(self, best: str) -> str:
         """Return why the run with the lowest action-ranking error is not recommended, as a sentence; empty if it is."""
-        verdict = self.measured[best].summary.ranks_actions
+        verdict = self.measured[best].summary.ranking
         if not _step(self.measured[best]):
             return f"{best}, with the lowest action-ranking error, was not fine-tuned."
         if verdict.conclusion == "yes":

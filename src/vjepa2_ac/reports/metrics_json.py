@@ -1,6 +1,6 @@
-"""Writing and reading of metrics.json (rows of an evaluation and the arrays behind them), and writing of metrics.csv.
+"""Write and read metrics.json: the rows of an evaluation and the arrays behind them. Write metrics.csv.
 
-Images are in the report only. The schema is in docs/evaluation_reference.md.
+The schema is in docs/evaluation_reference.md. Images are only in the report.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from vjepa2_ac.storage.structured import describe_validation_error, format_json
 
 METRICS_FILE = "metrics.json"
 FORMAT = 6  # incremented when a reader of the file would have to change
-# Part of an evaluation: words by which a note on its absence is recognised, and the text if there is no such note.
-_NEEDS = {
+# Part of an evaluation: words that a note on its absence contains, and the reason if there is no such note.
+_ABSENCE = {
     "base": ("no base", "The comparison needs a base model; a model without one was evaluated."),
     "distribution": ("spread", "The spread is a variance over clips and needs two clips or more."),
     "landscapes": ("energy landscapes", "They are measured by `vjepa2-ac evaluate --ranking-clips 32 --landscapes 8`."),
@@ -87,14 +87,14 @@ def missing_parts(evaluation: Evaluation) -> dict[str, str]:
     model = evaluation.models[evaluation.trained]
     parts = {**vars(evaluation), **vars(model), "base": evaluation.base}
     return {
-        part: next((note for note in evaluation.notes if word in note), needs)
-        for part, (word, needs) in _NEEDS.items()
+        part: next((note for note in evaluation.notes if words in note), reason)
+        for part, (words, reason) in _ABSENCE.items()
         if not parts.get(part)
     }
 
 
 def write_metrics(evaluation: Evaluation, path: Path, summary: Summary | None = None) -> Path:
-    """Write all metrics of an evaluation, and its summary (None: without a closed loop), atomically."""
+    """Write all metrics of an evaluation with its summary, atomically. None: the summary without a closed loop."""
     write_atomically(path, format_json(metrics_as_dict(evaluation, summary)))
     return path
 
@@ -121,13 +121,14 @@ def read_metrics(folder: Path) -> Metrics:
 
 
 def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> dict[str, Any]:
-    """Return all metrics as plain values; see docs/evaluation_reference.md for the meaning of each."""
+    """Return all metrics as plain values, by the schema in docs/evaluation_reference.md."""
     clips, decoded, rows = evaluation.clips, evaluation.decoded, make_rows(evaluation)
     summary = summary or summarize(evaluation, rows)
-    named = list(zip(clips.episode_ids, clips.starts, strict=True))
+    verdicts = TypeAdapter(Summary).dump_python(summary, by_alias=True)
+    clip_names = list(zip(clips.episode_ids, clips.starts, strict=True))
     metrics = {
         "format": FORMAT,
-        "summary": {**vars(summary), "sentence": summary.sentence},
+        "summary": {**verdicts, "sentence": summary.sentence},
         "trained": evaluation.trained,
         "base": evaluation.base,
         "about": evaluation.about,
@@ -135,8 +136,8 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
             "count": len(clips),
             "episodes": clips.episodes,
             "moving_means": clips.moving_rule,
-            "fingerprint": hashlib.sha256(json.dumps(named).encode()).hexdigest()[:16],
-            "named": named,
+            "fingerprint": hashlib.sha256(json.dumps(clip_names).encode()).hexdigest()[:16],
+            "named": clip_names,
         },
         "ranked": evaluation.ranked,
         "rows": rows,
@@ -157,7 +158,7 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
                 for name, model in evaluation.models.items()
             },
         },
-        "models": {  # the arrays behind the rows; those of the errors are in `by_clip`
+        "models": {  # arrays from which the rows are computed; the errors are in `by_clip`
             name: {key: getattr(model, key) for key in ("role", "ranking", "landscapes", "distribution")}
             for name, model in evaluation.models.items()
         },
@@ -166,18 +167,18 @@ def metrics_as_dict(evaluation: Evaluation, summary: Summary | None = None) -> d
         "not_measured": missing_parts(evaluation),
     }
     plain: dict[str, Any] = to_jsonable_python(
-        metrics, inf_nan_mode="null", fallback=lambda array: _rounded(array.tolist())
+        metrics, inf_nan_mode="null", fallback=lambda array: _round(array.tolist())
     )
     return plain
 
 
-def _rounded(value: Any) -> Any:
-    """Return the numbers of an array with 7 significant digits: more than a prediction in bfloat16 has."""
-    return [_rounded(item) for item in value] if isinstance(value, list) else float(f"{value:.7g}")
+def _round(value: Any) -> Any:
+    """Round the numbers of an array to 7 significant digits, which is more than the precision of bfloat16."""
+    return [_round(item) for item in value] if isinstance(value, list) else float(f"{value:.7g}")
 
 
 def write_csv(rows: Sequence[Row], path: Path) -> Path:
-    """Write all rows as CSV, atomically; columns are the fields of `Row`, missing numbers are nan."""
+    """Write all rows as CSV, atomically. The columns are the fields of `Row`; missing numbers are nan."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, [field.name for field in fields(Row)], lineterminator="\n")
     writer.writeheader()

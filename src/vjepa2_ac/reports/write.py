@@ -164,7 +164,7 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> lis
     }
     if evaluation.base is None:  # the first verdict already shows this error
         del labels[f"rollout.{L1.name}.over_persistence.{last}"]
-    if summary.plans is None:
+    if summary.planning is None:
         del labels["ranking.rank"]
     known = {(row.key, row.model): row for row in rows if not math.isnan(row.value)}
     return [

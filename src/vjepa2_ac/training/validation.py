@@ -13,7 +13,7 @@ from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.distributed import broadcast_object, gather_shared, own_share, share_work
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.action_use import RolloutStart, gather_starts, rank_actions, select_moves
+from vjepa2_ac.evaluation.action_use import Transition, gather_transitions, rank_actions, select_moves
 from vjepa2_ac.evaluation.measure import prediction_errors, previous_clip_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Validation, cost_of_actions, one_step_over_persistence, over_persistence
@@ -130,7 +130,7 @@ def _measure(run: Run) -> Validation:
     windows = validation_windows(run.dataset, "validation", clips=run.config.validation.clips)
     windows_range = own_share(len(windows), run.config.validation.batch_size)
     read = partial(read_batches, run.dataset, batch_size=run.config.validation.batch_size, allow_empty=True)
-    batches, moves = read(windows[windows_range.start : windows_range.stop]), list[RolloutStart]()
+    batches, moves = read(windows[windows_range.start : windows_range.stop]), list[Transition]()
     names = [(run.dataset.table.identity(episode), start) for episode, start in windows]
     ranking_clips = {names[index] for index in spread_indices(len(names), run.config.validation.ranking_clips or 0)}
     encoded = _encode_batches(run, batches, ranking_clips, moves)
@@ -138,7 +138,7 @@ def _measure(run: Run) -> Validation:
     for name, reason in gather_shared(list(run.dataset.broken.reasons.items())):
         run.dataset.broken.record(name, reason)
     config, space = run.config.validation, run.dataset.spaces.action
-    moves = gather_starts(moves, run.accelerator.device)
+    moves = gather_transitions(moves, run.accelerator.device)
     missing = len(ranking_clips) - len({(move.episode_id, move.first_step) for move in moves})
     replacements = (
         [window for window, name in zip(windows, names, strict=True) if name not in ranking_clips] if missing else []
@@ -152,7 +152,7 @@ def _measure(run: Run) -> Validation:
 
 
 def _encode_batches(
-    run: Run, batches: Iterable[Batch], ranking_clips: Container[tuple[str, int]], moves: list[RolloutStart]
+    run: Run, batches: Iterable[Batch], ranking_clips: Container[tuple[str, int]], moves: list[Transition]
 ) -> Iterator[LatentBatch]:
     """Yield the latents of batches, and append the moving steps of the clips in `ranking_clips` to `moves`."""
     for batch in batches:
