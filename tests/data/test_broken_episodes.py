@@ -1,4 +1,4 @@
-"""The policy for broken episodes: how many may be skipped, and every fix that an error names works."""
+"""Broken episodes: how many may be skipped; every fix that an error names works."""
 
 import json
 import re
@@ -29,7 +29,7 @@ def test_broken_episode_limit_is_three_or_one_percent_and_half_of_small_sets(epi
     assert max_broken(episodes) == allowed
 
 
-# ---- every fix that an error names works ----
+# ---- every fix that an error names works, for broken episodes of each origin ----
 
 
 def broken_in_the_index(episodes: int, broken: int, _folder: Path) -> Use:
@@ -37,10 +37,10 @@ def broken_in_the_index(episodes: int, broken: int, _folder: Path) -> Use:
     return lambda **values: open_in_memory(MemorySource([20] * (episodes - broken), problems=problems), **values)
 
 
-def broken_in_the_idle_pass(episodes: int, broken: int, folder: Path) -> Use:
-    knobs = {"idle": {"rule": "motion"}, "disk_cache": {"dir": str(folder)}}
+def broken_in_idle_filter(episodes: int, broken: int, folder: Path) -> Use:
+    options = {"idle": {"rule": "motion"}, "disk_cache": {"dir": str(folder)}}
     source = MemorySource([60] * episodes, unreadable=frozenset(range(episodes - broken, episodes)))
-    return lambda **values: open_in_memory(source, **knobs, **values)
+    return lambda **values: open_in_memory(source, **options, **values)
 
 
 def broken_in_a_clip(episodes: int, broken: int, _folder: Path) -> Use:
@@ -76,8 +76,8 @@ def parse_fixes(error: InputError) -> dict[str, Mapping[str, Any]]:
     fixes: dict[str, Mapping[str, Any]] = {}
     if "data.broken_episodes: skip" in error.fix:
         fixes["skip"] = {"broken_episodes": "skip"}
-    if listed := re.search(r"to data\.exclude: (\[.*\])", error.fix):
-        fixes["exclude"] = {"exclude": tuple(json.loads(listed[1]))}
+    if match := re.search(r"to data\.exclude: (\[.*\])", error.fix):
+        fixes["exclude"] = {"exclude": tuple(json.loads(match[1]))}
     return fixes
 
 
@@ -88,17 +88,25 @@ def follow_exclusions(use: Use, **values: Any) -> None:
         try:
             use(exclude=excluded, **values)
         except InputError as error:
-            more = parse_fixes(error)["exclude"]["exclude"]
-            assert not set(more) & set(excluded)
-            excluded += more
+            new_names = parse_fixes(error)["exclude"]["exclude"]
+            assert not set(new_names) & set(excluded)
+            excluded += new_names
         else:
             return
 
 
-SIZES = [(1, 1), (2, 1), (2, 2), (3, 1), (3, 2), (4, 2), (4, 3), (6, 3), (6, 4), (20, 1), (20, 12), (100, 4), (400, 4)]
+SIZES = [  # numbers of all episodes and of broken episodes
+    (1, 1), (2, 1), (2, 2), (3, 1), (3, 2), (4, 2), (4, 3), (6, 3), (6, 4), (20, 1), (20, 12), (100, 4), (400, 4),
+]  # fmt: skip
 CASES = [
     (make, episodes, broken)
-    for make in (broken_in_the_index, broken_in_the_idle_pass, broken_in_a_clip, duplicate_identities, broken_files)
+    for make in (
+        broken_in_the_index,
+        broken_in_idle_filter,
+        broken_in_a_clip,
+        duplicate_identities,
+        broken_files,
+    )
     for episodes, broken in (SIZES if make is not broken_files else SIZES[:-2])
     if make is not duplicate_identities or broken < episodes
 ]
@@ -112,10 +120,10 @@ def test_each_fix_in_a_broken_episode_error_works(
     with pytest.raises(InputError) as caught:
         use()
     fixes = parse_fixes(caught.value)
-    known = 1 if make is broken_in_a_clip else broken  # when the error is raised
-    is_few = known <= max_broken(episodes) and make is not duplicate_identities
-    is_rest = known < (episodes - 1 if make is duplicate_identities else episodes)
-    assert list(fixes) == ["skip"] * is_few + ["exclude"] * is_rest
+    num_reported = 1 if make is broken_in_a_clip else broken  # broken episodes that are known when the error is raised
+    may_be_skipped = num_reported <= max_broken(episodes) and make is not duplicate_identities
+    has_other_episodes = num_reported < (episodes - 1 if make is duplicate_identities else episodes)
+    assert list(fixes) == ["skip"] * may_be_skipped + ["exclude"] * has_other_episodes
     if "exclude" in fixes and broken < episodes:
         follow_exclusions(use)
     if broken <= max_broken(episodes) and "skip" in fixes:

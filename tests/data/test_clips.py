@@ -21,11 +21,11 @@ from vjepa2_ac.errors import InputError
 
 
 def open_set(folder: Path, **keys: Any) -> Dataset:
-    chosen = {"frames": 3, "stride": 2, "validation_share": 0.3, "test_share": 0.0} | keys
-    return open_dataset(DataConfig(path=str(folder), **chosen))
+    values = {"frames": 3, "stride": 2, "validation_share": 0.3, "test_share": 0.0} | keys
+    return open_dataset(DataConfig(path=str(folder), **values))
 
 
-def names(clips: list[Clip]) -> list[tuple[str, int]]:
+def windows_of(clips: list[Clip]) -> list[tuple[str, int]]:
     return [(clip.episode_id, clip.start) for clip in clips]
 
 
@@ -41,18 +41,17 @@ def test_clips_are_sorted_by_identity_and_start(droid: Path) -> None:
             np.testing.assert_array_equal(getattr(clip, part), getattr(expected, part))
     assert (clips[0].frames.dtype, clips[0].states.dtype, clips[0].actions.dtype) == (np.uint8, np.float32, np.float32)
     assert (clips[0].frames.ndim, clips[0].states.shape, clips[0].actions.shape) == (4, (3, 7), (2, 7))
-    every = names(list(clips))
-    assert all(one < other for one, other in pairwise(every))
+    assert all(first < second for first, second in pairwise(windows_of(list(clips))))
 
 
 def test_negative_indices_and_iteration_follow_the_sequence_protocol() -> None:
     clips = open_in_memory(MemorySource([9, 9])).clips()
     assert len(list(clips)) == len(clips) == 10
-    assert names([clips[-1], clips[-10]]) == names([clips[9], clips[0]])
-    assert names([clips[np.int64(3)], clips[torch.tensor(3)]]) == names([clips[3]] * 2)
-    for beyond in (10, -11):
+    assert windows_of([clips[-1], clips[-10]]) == windows_of([clips[9], clips[0]])
+    assert windows_of([clips[np.int64(3)], clips[torch.tensor(3)]]) == windows_of([clips[3]] * 2)
+    for invalid_index in (10, -11):
         with pytest.raises(IndexError):
-            clips[beyond]
+            clips[invalid_index]
     with pytest.raises(TypeError):
         clips[1.0]
 
@@ -67,7 +66,7 @@ def test_default_collate_returns_a_batch() -> None:
     assert (explicit.episode_ids, explicit.starts) == (batches[0].episode_ids, batches[0].starts)
     assert isinstance(next(iter(DataLoader(clips, batch_size=None))), Clip)
     moved = explicit.to("meta")
-    assert {one.device.type for one in (moved.frames, moved.states, moved.actions)} == {"meta"}
+    assert {tensor.device.type for tensor in (moved.frames, moved.states, moved.actions)} == {"meta"}
     assert moved.starts == explicit.starts
 
 

@@ -1,4 +1,4 @@
-"""Conversion to LeRobot v3.0: complete or absent, with the same values when read back."""
+"""Conversion to LeRobot v3.0: the values are equal when read back, and a failed conversion leaves no folder."""
 
 import json
 from collections.abc import Callable
@@ -39,8 +39,8 @@ def info_of(folder: Path) -> dict[str, Any]:
     return content
 
 
-def mean_difference(one: np.ndarray, other: np.ndarray) -> float:
-    return float(abs(one.astype(int) - other.astype(int)).mean())
+def mean_difference(first: np.ndarray, second: np.ndarray) -> float:
+    return float(abs(first.astype(int) - second.astype(int)).mean())
 
 
 def files_in(folder: Path) -> list[str]:
@@ -55,12 +55,14 @@ def test_converted_poses_equal_the_originals(droid: Path, tmp_path: Path) -> Non
     assert after.table.success.tolist() == before.table.success.tolist() == [1, 0, 1, 1, 1, 0]
     assert after.control_rate_hz == before.control_rate_hz == 15
     for index in range(6):
-        one, other = before.source.read(index), after.source.read(index)
-        np.testing.assert_array_equal(other.states, one.states.astype(np.float32))
-        np.testing.assert_allclose(actions_from_states(other.states), actions_from_states(one.states), atol=2e-6)
-        assert other.metadata == one.metadata == {"language": f"move to place {LENGTHS[index] - 12}"}
+        original, converted = before.source.read(index), after.source.read(index)
+        np.testing.assert_array_equal(converted.states, original.states.astype(np.float32))
+        np.testing.assert_allclose(
+            actions_from_states(converted.states), actions_from_states(original.states), atol=2e-6
+        )
+        assert converted.metadata == original.metadata == {"language": f"move to place {LENGTHS[index] - 12}"}
         for camera in CAMERAS:
-            steps = range(len(one.states))
+            steps = range(len(original.states))
             frames = [dataset.source.read(index, camera).read_frames(steps) for dataset in (before, after)]
             assert mean_difference(*frames) < 3
     table = parquet.read_table(tmp_path / "out/data/chunk-000/file-000.parquet")
@@ -119,9 +121,9 @@ def test_converted_files_have_the_lerobot_layout(droid: Path, tmp_path: Path) ->
     }  # fmt: skip
     assert features["action"]["names"] == ["dx", "dy", "dz", "droll", "dpitch", "dyaw", "dgripper"]
     assert features["is_episode_successful"] == {"dtype": "bool", "shape": [1], "names": None}
-    about = features[key].pop("info")
+    camera_info = features[key].pop("info")
     assert features[key] == {"dtype": "video", "shape": [48, 96, 3], "names": ["height", "width", "channels"]}
-    assert about == {
+    assert camera_info == {
         "video.height": 48, "video.width": 96, "video.codec": "h264", "video.pix_fmt": "yuv420p",
         "video.is_depth_map": False, "video.fps": 15, "video.channels": 3, "has_audio": False,
     }  # fmt: skip
@@ -152,33 +154,40 @@ def test_converted_statistics_match_numbers_and_pixels(droid: Path, tmp_path: Pa
     convert_to_lerobot(config_of(droid), tmp_path / "out", SILENT)
     dataset = open_dataset(config_of(droid))
     states = [dataset.source.read(index).states.astype(np.float32) for index in range(6)]
-    found = json.loads((tmp_path / "out/meta/stats.json").read_text())
-    whole, of_state = np.concatenate(states), found["observation.state"]
+    statistics = json.loads((tmp_path / "out/meta/stats.json").read_text())
+    all_states, state_statistics = np.concatenate(states), statistics["observation.state"]
     for kind in ("min", "max", "mean", "std"):
-        np.testing.assert_allclose(of_state[kind], getattr(np, kind)(whole.astype(float), axis=0), atol=1e-6)
-    assert of_state["count"] == [87]
-    weights = [len(one) / 87 for one in states]
-    medians = sum(weight * np.median(one, axis=0) for weight, one in zip(weights, states, strict=True))
-    np.testing.assert_allclose(of_state["q50"], medians, atol=1e-6)
-    of_success, of_pixels = found["is_episode_successful"], found["observation.images.exterior_1_left"]
-    assert (of_success["min"], of_success["max"]) == ([False], [True])
+        np.testing.assert_allclose(
+            state_statistics[kind], getattr(np, kind)(all_states.astype(float), axis=0), atol=1e-6
+        )
+    assert state_statistics["count"] == [87]
+    weights = [len(episode_states) / 87 for episode_states in states]
+    medians = sum(
+        weight * np.median(episode_states, axis=0) for weight, episode_states in zip(weights, states, strict=True)
+    )
+    np.testing.assert_allclose(state_statistics["q50"], medians, atol=1e-6)
+    success_statistics, pixel_statistics = (
+        statistics["is_episode_successful"],
+        statistics["observation.images.exterior_1_left"],
+    )
+    assert (success_statistics["min"], success_statistics["max"]) == ([False], [True])
     frames = (
         np.concatenate([dataset.source.read(i).read_frames(range(LENGTHS[i])) for i in range(6)]).reshape(-1, 3) / 255
     )
     for kind in ("min", "max", "mean", "std"):
-        np.testing.assert_allclose(np.ravel(of_pixels[kind]), getattr(np, kind)(frames, axis=0), atol=1e-9)
-    assert (np.shape(of_pixels["mean"]), of_pixels["count"]) == ((3, 1, 1), [87])
+        np.testing.assert_allclose(np.ravel(pixel_statistics[kind]), getattr(np, kind)(frames, axis=0), atol=1e-9)
+    assert (np.shape(pixel_statistics["mean"]), pixel_statistics["count"]) == ((3, 1, 1), [87])
 
 
-def test_conversion_writes_whole_episodes_and_omits_excluded_ones(droid: Path, tmp_path: Path) -> None:
+def test_conversion_writes_idle_steps_and_omits_excluded_episodes(droid: Path, tmp_path: Path) -> None:
     idle = {"rule": "motion", "shortest_kept_steps": 2, "cut_last_steps": 6}
     config = config_of(droid, idle=idle, validation_share=0.5, stride="auto")
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (6, 87)
-    never_read = config_of(droid, idle={"rule": "published", "ranges": str(tmp_path / "missing.json")})
-    assert convert_to_lerobot(never_read, tmp_path / "again", SILENT) == (6, 87)
+    missing_list = config_of(droid, idle={"rule": "published", "ranges": str(tmp_path / "missing.json")})
+    assert convert_to_lerobot(missing_list, tmp_path / "unfiltered", SILENT) == (6, 87)
     first = open_dataset(config_of(droid)).table.identity(0)
-    left = config_of(droid, idle=idle, exclude=[first], outcome="success")
-    assert convert_to_lerobot(left, tmp_path / "less", SILENT) == (3, 13 + 15 + 16)
+    filtered = config_of(droid, idle=idle, exclude=[first], outcome="success")
+    assert convert_to_lerobot(filtered, tmp_path / "less", SILENT) == (3, 13 + 15 + 16)
     assert read_back(tmp_path / "less", "exterior_1_left").table.num_steps.tolist() == [16, 13, 15]
 
 

@@ -37,29 +37,29 @@ def open_set(names: list[str] | None = None, **changes: Any) -> Dataset:
 def splits_of(dataset: Dataset) -> dict[str, str]:
     """Return the split of every episode, determined from the clips of each split."""
     return {
-        dataset.table.identity(int(place)): split
+        dataset.table.identity(int(index)): split
         for split in ("train", "validation", "test")
-        for place in dataset.windows(split).episodes  # type: ignore[arg-type]
+        for index in dataset.windows(split).episodes  # type: ignore[arg-type]
     }
 
 
-def groups_split(dataset: Dataset, group: Any) -> dict[str, set[str]]:
-    found = defaultdict(set)
+def splits_by_group(dataset: Dataset, group_of: Any) -> dict[str, set[str]]:
+    splits = defaultdict(set)
     for name, split in splits_of(dataset).items():
-        found[group(name)].add(split)
-    return dict(found)
+        splits[group_of(name)].add(split)
+    return dict(splits)
 
 
-@pytest.mark.parametrize("by", ["day", r"/(\d{4}-\d\d-\d\d)/"])
-def test_episodes_of_a_group_are_in_the_same_split(by: str) -> None:
-    dataset = open_set(split_by=by)
-    days = groups_split(dataset, lambda name: name.split("/")[7])
+@pytest.mark.parametrize("split_by", ["day", r"/(\d{4}-\d\d-\d\d)/"])
+def test_episodes_of_a_group_are_in_the_same_split(split_by: str) -> None:
+    dataset = open_set(split_by=split_by)
+    days = splits_by_group(dataset, lambda name: name.split("/")[7])
     assert days == {day: {split_of(day, dataset.config)} for day in days}
     assert len(days) == 7
     assert sum(len(dataset.windows(split)) for split in ("train", "validation", "test")) == 60 * (20 - 4)
 
 
-def count_of_groups(dataset: Dataset) -> int:
+def count_groups(dataset: Dataset) -> int:
     return len(np.unique(dataset.split_hash))
 
 
@@ -75,27 +75,33 @@ def test_identity_without_a_group_raises() -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "by", "groups"),
+    ("source", "split_by", "num_groups"),
     [("npz", "scene", 3), ("npz", "task", 2), ("lerobot", "task", 2), ("droid_raw", "day", 8), ("rlds", "lab", 2)],
 )
-def test_each_source_provides_its_labels_for_split_by(source: str, by: str, groups: int, tmp_path: Path) -> None:
+def test_each_source_provides_its_labels_for_split_by(
+    source: str, split_by: str, num_groups: int, tmp_path: Path
+) -> None:
     folder = tmp_path / "set"
     if source == "npz":
-        write_npz(folder, range(8), scene=lambda place: f"room {place % 3}", language=lambda place: f"task {place % 2}")
+        write_npz(
+            folder, range(8), scene=lambda number: f"room {number % 3}", language=lambda number: f"task {number % 2}"
+        )
     else:
         {"lerobot": write_lerobot, "droid_raw": write_raw, "rlds": write_rlds}[source](folder, range(8))
-    dataset = open_dataset(config_of(source=source, path=str(folder), split_by=by, disk_cache={"dir": str(tmp_path)}))
-    assert count_of_groups(dataset) == groups
+    dataset = open_dataset(
+        config_of(source=source, path=str(folder), split_by=split_by, disk_cache={"dir": str(tmp_path)})
+    )
+    assert count_groups(dataset) == num_groups
 
 
 def test_episode_without_a_split_by_value_raises(tmp_path: Path) -> None:
-    folder = write_npz(tmp_path / "set", range(4), scene=lambda place: "" if place == 2 else "kitchen")
+    folder = write_npz(tmp_path / "set", range(4), scene=lambda number: "" if number == 2 else "kitchen")
     with pytest.raises(InputError, match=r"the data set has no value for 1 of 4 episodes: 002"):
         open_dataset(config_of(source="npz", path=str(folder), split_by="scene"))
 
 
 def test_latent_cache_supports_any_split_by(tmp_path: Path) -> None:
-    write_npz(tmp_path / "set", range(8), scene=lambda place: f"room {place % 3}")
+    write_npz(tmp_path / "set", range(8), scene=lambda number: f"room {number % 3}")
     plain = config_of(source="npz", path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")})
     folder = write_cache(open_dataset(plain))
-    assert count_of_groups(open_dataset(plain.with_source("latents", path=str(folder), split_by="scene"))) == 3
+    assert count_groups(open_dataset(plain.with_source("latents", path=str(folder), split_by="scene"))) == 3

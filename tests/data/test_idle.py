@@ -1,4 +1,4 @@
-"""Idle steps: the same as in openpi; moving steps are never idle."""
+"""Idle steps: the same ranges as in openpi; steps with motion are never idle; ranges are cached."""
 
 import json
 from functools import partial
@@ -24,7 +24,7 @@ COMMANDS = IdleConfig(rule="commands")
 MOTION = IdleConfig(rule="motion")
 
 
-def resting(steps: int, rests: list[tuple[int, int]], *, seed: int = 0) -> np.ndarray:
+def states_with_rests(steps: int, rests: list[tuple[int, int]], *, seed: int = 0) -> np.ndarray:
     """Return a trajectory in which nothing changes during the rests: step t equals step t - 1."""
     states = synthetic_states(steps, seed=seed)
     for start, end in rests:
@@ -48,14 +48,14 @@ def test_translation_rotation_or_gripper_motion_is_not_idle(number: int) -> None
 
 
 def test_idle_steps_are_detected_where_roll_wraps() -> None:
-    states = resting(60, [(20, 40)])
+    states = states_with_rests(60, [(20, 40)])
     states[20:40, 3] += np.where(np.arange(20) % 2, 2 * np.pi, 0)  # the same angle, plus 2 pi
     idle = find_idle_by_motion(states, MOTION)
     assert np.flatnonzero(idle).tolist() == list(range(20, 40))
     assert find_moving_ranges(idle, MOTION) == [(0, 10), (40, 50)]
 
 
-def test_short_idle_runs_are_not_removed_and_short_moves_are() -> None:
+def test_long_idle_runs_and_short_moves_are_removed() -> None:
     def ranges(rests: list[tuple[int, int]], **options: Any) -> list[tuple[int, int]]:
         idle = np.zeros(80, bool)
         for start, end in rests:
@@ -79,10 +79,10 @@ def test_selected_ranges_are_disjoint_and_contain_no_long_idle_run(idle: list[bo
     assert edges == sorted(set(edges))
     assert all(0 <= edge <= len(idle) for edge in edges)
     for start, end in ranges:
-        assert "1" * 7 not in "".join(str(int(one)) for one in idle[start:end])
+        assert "1" * 7 not in "".join(str(int(is_idle)) for is_idle in idle[start:end])
 
 
-# Data sets: the ranges are computed once and cached.
+# ---- ranges of a data set are computed once and cached ----
 
 
 @pytest.fixture
@@ -92,7 +92,9 @@ def open_with(tmp_path: Path) -> Any:
 
 def source_with_rests(lengths: list[int] | None = None, **options: Any) -> MemorySource:
     return MemorySource(
-        lengths or [60, 40, 80], states=lambda index: resting((lengths or [60, 40, 80])[index], [(20, 35)]), **options
+        lengths or [60, 40, 80],
+        states=lambda index: states_with_rests((lengths or [60, 40, 80])[index], [(20, 35)]),
+        **options,
     )
 
 
@@ -114,21 +116,21 @@ def test_clips_are_inside_the_selected_ranges(open_with: Any) -> None:
         for first, end in dataset.selected_steps.ranges_of(episode)
         for start in range(first, end - 4)
     }
-    removed = {one.name: one for one in dataset.removed}["idle"]
-    assert (removed.episodes, removed.steps) == (0, 180 - 25 - 10 - 45)
-    assert removed.windows == 56 + 36 + 76 - len(starts(dataset))
+    removal = {removed.name: removed for removed in dataset.removed}["idle"]
+    assert (removal.episodes, removal.steps) == (0, 180 - 25 - 10 - 45)
+    assert removal.windows == 56 + 36 + 76 - len(starts(dataset))
 
 
 def test_idle_ranges_are_computed_once(open_with: Any) -> None:
     first, second, third = source_with_rests(), source_with_rests(), source_with_rests()
-    kept = open_with(first, idle=MOTION).selected_steps
-    again = open_with(second, idle=MOTION, exclude=("episode 1",), stride=3).selected_steps
+    ranges = open_with(first, idle=MOTION).selected_steps
+    other_ranges = open_with(second, idle=MOTION, exclude=("episode 1",), stride=3).selected_steps
     assert [index for index, *_ in first.reads] == [0, 1, 2]
     assert second.reads == []
-    assert again.ranges_of(2) == kept.ranges_of(2)
-    assert again.ranges_of(1) == ()
+    assert other_ranges.ranges_of(2) == ranges.ranges_of(2)
+    assert other_ranges.ranges_of(1) == ()
     open_with(third, idle=MOTION.model_copy(update={"cut_last_steps": 4}))
-    assert len(third.reads) == 3, "another rule is another pass"
+    assert len(third.reads) == 3, "another rule needs all episodes again"
 
 
 def test_episode_that_fails_while_ranges_are_computed_is_broken(open_with: Any, caplog: Any) -> None:
@@ -139,18 +141,18 @@ def test_episode_that_fails_while_ranges_are_computed_is_broken(open_with: Any, 
     dataset = open_with(source, idle=MOTION, broken_episodes="skip")
     assert "2 of 200 episodes are broken and skipped: episode 7, episode 9" in caplog.text
     assert not dataset.is_selected[[7, 9]].any()
-    assert {one.name: one.episodes for one in dataset.removed}["broken"] == 2
+    assert {removal.name: removal.episodes for removal in dataset.removed}["broken"] == 2
     assert len(open_with(source, idle=MOTION, exclude=("episode 7", "episode 9")).broken) == 0
 
 
-def test_wrong_setting_stops_the_pass_after_ten_episodes(open_with: Any) -> None:
+def test_wrong_idle_setting_raises_after_ten_episodes(open_with: Any) -> None:
     source = MemorySource([40] * 50)
     with pytest.raises(InputError, match="no commanded joint velocities"):
         open_with(source, idle=COMMANDS, broken_episodes="skip")
     assert len(source.reads) <= 14
 
 
-# Ranges from a published list.
+# ---- ranges from a published list ----
 
 
 def published(tmp_path: Path, content: object) -> dict[str, Any]:

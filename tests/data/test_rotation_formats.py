@@ -1,4 +1,4 @@
-"""Formats of rotation numbers: a wrong format is detected at jumps, the right one is never rejected."""
+"""Formats of rotation numbers: a wrong format is detected at jumps, the right format is never rejected."""
 
 from collections.abc import Callable
 
@@ -20,7 +20,7 @@ BASES: dict[str, Callable[[np.random.Generator], Rotation]] = {
 
 
 def smooth_motion(base: str, seed: int) -> tuple[list[Rotation], float]:
-    """Return the rotations of a hand in ten episodes, and their rate: it turns and tilts a little around a base."""
+    """Return rotations of a hand that turns around a base rotation, for ten episodes, and their rate in Hz."""
     rng = np.random.default_rng(seed)
     rate_hz, noise_rad = float(rng.choice(RATES_HZ)), float(rng.choice([0.0, 0.0005, 0.003]))
     amplitudes = np.append(np.full(2, rng.uniform(0.05, 0.4)), rng.uniform(0.1, 1.2))
@@ -36,18 +36,18 @@ def smooth_motion(base: str, seed: int) -> tuple[list[Rotation], float]:
     return episodes, rate_hz
 
 
-def numbers_of(rotation: Rotation, written_as: RotationFormat) -> np.ndarray:
-    if written_as == "rotation_vector":
+def numbers_of(rotation: Rotation, rotation_format: RotationFormat) -> np.ndarray:
+    if rotation_format == "rotation_vector":
         return np.asarray(rotation.as_rotvec())
-    return np.asarray(rotation.as_euler("xyz", degrees=written_as == "euler_xyz_degrees"))
+    return np.asarray(rotation.as_euler("xyz", degrees=rotation_format == "euler_xyz_degrees"))
 
 
-def formats_named(numbers: list[np.ndarray], rate_hz: float) -> dict[RotationFormat, RotationFormat | None]:
+def find_smoother_formats(numbers: list[np.ndarray], rate_hz: float) -> dict[RotationFormat, RotationFormat | None]:
     speeds = measure_rotation_speeds(numbers, rate_hz)
     return {configured: find_smoother_format(speeds, configured, MAX_RAD_S) for configured in FORMATS}
 
 
-def as_written(numbers: np.ndarray) -> np.ndarray:
+def unchanged(numbers: np.ndarray) -> np.ndarray:
     return numbers
 
 
@@ -68,35 +68,40 @@ def rounded(numbers: np.ndarray) -> np.ndarray:
     return np.round(numbers, 2)
 
 
-@pytest.mark.parametrize("written_as", FORMATS)
+@pytest.mark.parametrize("rotation_format", FORMATS)
 @pytest.mark.parametrize("base", BASES)
-def test_correct_rotation_format_is_never_rejected(base: str, written_as: RotationFormat) -> None:
+def test_correct_rotation_format_is_never_rejected(base: str, rotation_format: RotationFormat) -> None:
     for seed in range(8):
         episodes, rate_hz = smooth_motion(base, seed)
-        numbers = [numbers_of(one, written_as) for one in episodes]
-        for change in (as_written, repeated, with_dropouts, padded, rounded):
-            assert formats_named([change(one) for one in numbers], rate_hz)[written_as] is None, (seed, change)
+        numbers = [numbers_of(rotations, rotation_format) for rotations in episodes]
+        for change in (unchanged, repeated, with_dropouts, padded, rounded):
+            assert find_smoother_formats([change(episode) for episode in numbers], rate_hz)[rotation_format] is None, (
+                seed,
+                change,
+            )
         joined = [np.concatenate(numbers[first : first + 5]) for first in (0, 5)]
-        assert formats_named(joined, rate_hz)[written_as] is None, seed
+        assert find_smoother_formats(joined, rate_hz)[rotation_format] is None, seed
 
 
-@pytest.mark.parametrize("written_as", FORMATS)
-@pytest.mark.parametrize("change", [as_written, repeated, with_dropouts, padded, rounded])
+@pytest.mark.parametrize("rotation_format", FORMATS)
+@pytest.mark.parametrize("change", [unchanged, repeated, with_dropouts, padded, rounded])
 def test_wrong_rotation_format_is_detected_for_a_hand_pointing_down(
-    written_as: RotationFormat, change: Callable[[np.ndarray], np.ndarray]
+    rotation_format: RotationFormat, change: Callable[[np.ndarray], np.ndarray]
 ) -> None:
     for seed in range(8):
         episodes, rate_hz = smooth_motion("down", seed)
-        named = formats_named([change(numbers_of(one, written_as)) for one in episodes], rate_hz)
-        wrong = [configured for configured in FORMATS if configured != written_as]
-        assert [named[configured] for configured in wrong] == [written_as] * 2, seed
+        smoother_formats = find_smoother_formats(
+            [change(numbers_of(rotations, rotation_format)) for rotations in episodes], rate_hz
+        )
+        wrong_formats = [configured for configured in FORMATS if configured != rotation_format]
+        assert [smoother_formats[configured] for configured in wrong_formats] == [rotation_format] * 2, seed
 
 
 def test_numbers_without_jumps_do_not_identify_the_format() -> None:
-    numbers = [numbers_of(one, "rotation_vector") for one in smooth_motion("near zero", 0)[0]]
+    numbers = [numbers_of(rotations, "rotation_vector") for rotations in smooth_motion("near zero", 0)[0]]
     speeds = measure_rotation_speeds(numbers, 15.0)
-    assert {one.num_jumps for one in speeds.values()} == {0}
-    assert set(formats_named(numbers, 15.0).values()) == {None}
+    assert {format_speeds.num_jumps for format_speeds in speeds.values()} == {0}
+    assert set(find_smoother_formats(numbers, 15.0).values()) == {None}
 
 
 def test_rotation_speeds_match_the_rotation_in_each_format() -> None:
@@ -108,12 +113,14 @@ def test_rotation_speeds_match_the_rotation_in_each_format() -> None:
     (at_the_wrap,) = speeds["euler_xyz"].at_jumps
     assert at_the_wrap == pytest.approx(1.0)
     assert speeds["rotation_vector"].at_jumps[0] > 5
-    assert [one.num_smooth_jumps for one in speeds.values()] == [1, 0, 0]
+    assert [format_speeds.num_smooth_jumps for format_speeds in speeds.values()] == [1, 0, 0]
 
 
 def test_numbers_too_large_or_too_fast_for_radians_are_degrees() -> None:
     degrees = np.linspace(-170.0, -120.0, 40)[:, None] * [1.0, 0, 0] + [0.0, 3.0, 20.0]
     assert [*measure_rotation_speeds([degrees], 10.0)] == ["euler_xyz_degrees"]
-    assert formats_named([degrees], 10.0) == dict.fromkeys(FORMATS, "euler_xyz_degrees") | {"euler_xyz_degrees": None}
+    assert find_smoother_formats([degrees], 10.0) == dict.fromkeys(FORMATS, "euler_xyz_degrees") | {
+        "euler_xyz_degrees": None
+    }
     small = 5 * np.sin(np.arange(60)[:, None] * [1.0, 1.3, 1.7] / 3)
-    assert formats_named([small], 10.0)["euler_xyz"] == "euler_xyz_degrees"
+    assert find_smoother_formats([small], 10.0)["euler_xyz"] == "euler_xyz_degrees"

@@ -1,4 +1,4 @@
-"""The data set's own splits are used; a missing split is drawn by hash, and pooled splits are reported."""
+"""The data set's own splits are used; a missing split is drawn by hash, and splits that are not used are reported."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ def write_rlds_splits(folder: Path, *names: str) -> Path:
     write_synthetic_droid(folder, episodes=EPISODES * count, steps=14, shards=count, size=(24, 32))
     info = json.loads((folder / "dataset_info.json").read_text())
     counts = [count for split in info["splits"] for count in split["shardLengths"]]
-    info["splits"] = [{"name": name, "shardLengths": [of_shard]} for name, of_shard in zip(names, counts, strict=True)]
+    info["splits"] = [
+        {"name": name, "shardLengths": [num_episodes]} for name, num_episodes in zip(names, counts, strict=True)
+    ]
     shards = sorted(folder.glob("*.tfrecord-*"))
     for number, (name, shard) in enumerate(zip(names, shards, strict=True)):
         assert f"{number:05d}-of" in shard.name
@@ -63,19 +65,21 @@ def open_set(tmp_path: Path) -> Opened:
 
 
 def members(dataset: Dataset) -> dict[str, str]:
-    """Return the split of each episode, by the number at the end of its identity."""
-    found = {}
+    """Return the split of each episode by its identity."""
+    splits = {}
     for split in SPLITS:
-        for place in dataset.split_mask(split).nonzero()[0].tolist():
-            identity = dataset.table.identity(place)
-            assert identity not in found
-            found[identity] = split
-    return found
+        for index in dataset.split_mask(split).nonzero()[0].tolist():
+            identity = dataset.table.identity(index)
+            assert identity not in splits
+            splits[identity] = split
+    return splits
 
 
 def numbers_in(dataset: Dataset, split: Split) -> set[int]:
-    """Return the numbers of the drawn episodes in a split."""
-    return {int(name.split("episode_")[1][:4]) for name, one in members(dataset).items() if one == split}
+    """Return the numbers of the synthetic episodes in a split."""
+    return {
+        int(name.split("episode_")[1][:4]) for name, episode_split in members(dataset).items() if episode_split == split
+    }
 
 
 @pytest.mark.parametrize("val", ["val", "valid", "validation", "Val"])
@@ -84,7 +88,7 @@ def test_rlds_splits_are_used(val: str, open_set: Opened, tmp_path: Path) -> Non
     assert [numbers_in(dataset, split) for split in ("test", "train", "validation")] == [
         set(range(start, 3 * EPISODES, 3)) for start in range(3)
     ]
-    assert {int(place) for place in dataset.windows("test").episodes} == set(
+    assert {int(index) for index in dataset.windows("test").episodes} == set(
         dataset.split_mask("test").nonzero()[0].tolist()
     )
     role = "validation" if val == "validation" else f"{val} (4 episodes) as validation"
@@ -109,7 +113,7 @@ def test_missing_split_is_drawn_from_train_only(open_set: Opened, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("names", "changes", "why"),
+    ("names", "changes", "reason"),
     [
         (("train", "val"), {"splits": "hash"}, "data.splits is hash"),
         (("part_1", "part_2"), {}, "they do not include both train and a held-out split"),
@@ -117,28 +121,28 @@ def test_missing_split_is_drawn_from_train_only(open_set: Opened, tmp_path: Path
     ],
 )
 def test_unusable_splits_are_pooled_and_drawn_by_hash(
-    names: tuple[str, ...], changes: dict[str, str], why: str, open_set: Opened, tmp_path: Path
+    names: tuple[str, ...], changes: dict[str, str], reason: str, open_set: Opened, tmp_path: Path
 ) -> None:
     dataset = open_set(write_rlds_splits(tmp_path / "set", *names), **changes)
-    assert members(dataset) == {one.id: split_of(one.id, dataset.config) for one in dataset.table}
+    assert members(dataset) == {info.id: split_of(info.id, dataset.config) for info in dataset.table}
     text = describe_splits(dataset.table, dataset.config)
-    assert f"because {why}: " in text
+    assert f"because {reason}: " in text
     assert all(f"{name} (4 episodes)" in text for name in names)
 
 
 def test_single_split_is_drawn_by_hash_with_the_same_index(open_set: Opened, tmp_path: Path) -> None:
     folder = write_rlds(tmp_path / "set", range(8))
-    one, pooled = open_set(folder), open_set(folder, splits="hash")
-    assert one.table.to_bytes() == pooled.table.to_bytes()
-    assert "split" not in one.table.labels
-    assert members(one) == {info.id: split_of(info.id, one.config) for info in one.table}
-    assert describe_splits(one.table, one.config) == ""
+    dataset, pooled = open_set(folder), open_set(folder, splits="hash")
+    assert dataset.table.to_bytes() == pooled.table.to_bytes()
+    assert "split" not in dataset.table.labels
+    assert members(dataset) == {info.id: split_of(info.id, dataset.config) for info in dataset.table}
+    assert describe_splits(dataset.table, dataset.config) == ""
 
 
 def test_lerobot_splits_are_ranges_of_episode_numbers(open_set: Opened, tmp_path: Path) -> None:
     folder = write_lerobot_splits(tmp_path / "set", 6, {"train": "0:3", "val": "3:5", "test": "5:6"})
-    found = members(open_set(folder, source="lerobot"))
-    assert [found[f"episode_{number:06d}"] for number in range(6)] == [
+    splits = members(open_set(folder, source="lerobot"))
+    assert [splits[f"episode_{number:06d}"] for number in range(6)] == [
         "train", "train", "train", "validation", "validation", "test",
     ]  # fmt: skip
 
@@ -153,10 +157,10 @@ def test_excluding_all_episodes_of_a_split_raises_with_the_config_key(open_set: 
 def test_check_reports_the_used_splits(open_set: Opened, tmp_path: Path) -> None:
     config = open_set(write_rlds_splits(tmp_path / "set", "train", "test")).config
     findings = list(check_data(config, clips=2))
-    assert [one.text for one in findings if one.about == "splits"] == [
+    assert [finding.text for finding in findings if finding.about == "splits"] == [
         "the data set's own: test (4 episodes), train (4 episodes); validation is drawn from train by hash"
     ]
-    (advice,) = [one.text for one in findings if "cannot show whether" in one.text]
+    (advice,) = [finding.text for finding in findings if "cannot show whether" in finding.text]
     assert advice.endswith("data.splits=hash draws the test split from all episodes")
     single = config.model_copy(update={"path": str(write_rlds_splits(tmp_path / "one", "train")), "test_share": 0.1})
-    assert "splits" not in {one.about for one in check_data(single, clips=2)}
+    assert "splits" not in {finding.about for finding in check_data(single, clips=2)}

@@ -13,31 +13,32 @@ from vjepa2_ac.data.poses import convert_poses
 from vjepa2_ac.data.sources.lerobot import LeRobotSource
 from vjepa2_ac.errors import InputError
 
-IN_OTHER_UNITS = {"position_unit": "mm", "rotation": "euler_xyz_degrees"}
+UNIT_KEYS = {"position_unit": "mm", "rotation": "euler_xyz_degrees"}
 SCALE = np.array([1000.0] * 3 + [180 / np.pi] * 3)
 
 
 def write_lerobot(folder: Path) -> Path:
+    """Write a data set in millimetres and degrees."""
     episode = recorded(0, 12)
     pose = (episode.columns[STATE[0]] * SCALE).astype(np.float32)
     return write_v30(folder, [Recorded({**episode.columns, STATE[0]: pose}, episode.frames)])
 
 
 def test_lerobot_unit_errors_name_the_keys_that_fix_them(tmp_path: Path) -> None:
-    def opened(**fields: Any) -> LeRobotSource:
+    def open_source(**fields: Any) -> LeRobotSource:
         return LeRobotSource(LeRobotData(path=str(folder), lerobot=fields, disk_cache={"dir": str(tmp_path / "cache")}))
 
     folder = write_lerobot(tmp_path / "set")
     with pytest.raises(InputError) as raised:
-        opened().infos()
+        open_source().infos()
     assert raised.value.fix.startswith(
         "The positions look like millimetres: set data.lerobot.position_unit: mm."
         " The angles look like degrees: set data.lerobot.rotation: euler_xyz_degrees. Check data.lerobot: state, "
     )
     with pytest.raises(InputError, match="look like degrees") as raised:
-        opened(position_unit="mm").infos()
+        open_source(position_unit="mm").infos()
     assert "millimetres" not in raised.value.fix
-    np.testing.assert_allclose(opened(**IN_OTHER_UNITS).read(0).states, synthetic_states(12, seed=0), atol=1e-5)
+    np.testing.assert_allclose(open_source(**UNIT_KEYS).read(0).states, synthetic_states(12, seed=0), atol=1e-5)
 
 
 def test_configured_unit_is_not_rejected() -> None:

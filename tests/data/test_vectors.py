@@ -35,8 +35,8 @@ def vector_config(path: object, **changes: Any) -> DataConfig:
     return DataConfig.model_validate_json(json.dumps(values | changes))
 
 
-def recorded_by(how: str | None, **changes: Any) -> dict[str, Any]:
-    return {"actions": "recorded", "join_actions": how} | changes
+def join_recorded(operation: str | None, **changes: Any) -> dict[str, Any]:
+    return {"actions": "recorded", "join_actions": operation} | changes
 
 
 @pytest.mark.parametrize("width", [1, 7, 14])
@@ -49,11 +49,11 @@ def test_vector_states_are_the_stored_numbers_and_actions_their_differences(tmp_
     np.testing.assert_array_equal(clip.actions, (written[[5, 7]] - written[[3, 5]]).astype(np.float32))
 
 
-@pytest.mark.parametrize(("how", "join"), [("sum", np.sum), ("mean", np.mean), ("last", lambda x, **_: x[:, -1])])
+@pytest.mark.parametrize(("operation", "join"), [("sum", np.sum), ("mean", np.mean), ("last", lambda x, **_: x[:, -1])])
 def test_commands_of_a_model_step_are_joined_control_steps(
-    tmp_path: Path, how: str, join: Callable[..., np.ndarray]
+    tmp_path: Path, operation: str, join: Callable[..., np.ndarray]
 ) -> None:
-    dataset = open_dataset(vector_config(write_vectors(tmp_path, width=14, action_width=5), **recorded_by(how)))
+    dataset = open_dataset(vector_config(write_vectors(tmp_path, width=14, action_width=5), **join_recorded(operation)))
     assert dataset.widths == Widths(14, 5)
     clip = clip_at(dataset, 1, 4)
     written = vectors(24, 5, seed=1001)  # of control steps 4, 5 and 6, 7
@@ -62,7 +62,7 @@ def test_commands_of_a_model_step_are_joined_control_steps(
 
 def test_rlds_reads_the_configured_features(droid: Path) -> None:
     fields = {"state": JOINTS, "action": VELOCITIES}
-    config = vector_config(droid, source="rlds", fields=fields, **recorded_by("mean"))
+    config = vector_config(droid, source="rlds", fields=fields, **join_recorded("mean"))
     dataset = open_dataset(config)
     assert dataset.widths == Widths(8, 8)
     episode = dataset.source.read(0)
@@ -70,9 +70,9 @@ def test_rlds_reads_the_configured_features(droid: Path) -> None:
     joints = np.sin(steps[:, None] / 15.0 + np.arange(7))
     np.testing.assert_allclose(episode.states[:, :7], joints, atol=1e-6)
     np.testing.assert_allclose(episode.commands[:, :7], np.gradient(joints, axis=0), atol=1e-6)
-    without = config.model_copy(update={"fields": config.fields.model_copy(update={"action": ("steps/actoin",)})})
+    mistyped = config.model_copy(update={"fields": config.fields.model_copy(update={"action": ("steps/actoin",)})})
     with pytest.raises(InputError, match="Did you mean steps/action"):
-        open_dataset(without)
+        open_dataset(mistyped)
 
 
 def test_rlds_vector_width_is_unknown_without_a_flag_per_step(
@@ -95,16 +95,18 @@ def bimanual(number: int, steps: int) -> Recorded:
 def test_lerobot_reads_the_configured_columns(tmp_path: Path, write: Callable[..., Path]) -> None:
     folder = write(tmp_path / "set", [bimanual(number, 12) for number in range(4)])
     lerobot = {"state": ["observation.state"], "success": None}
-    dataset = open_dataset(vector_config(folder, source="lerobot", lerobot=lerobot, **recorded_by("last")))
+    dataset = open_dataset(vector_config(folder, source="lerobot", lerobot=lerobot, **join_recorded("last")))
     assert dataset.widths == Widths(14, 16)
     clip = clip_at(dataset, 2, 1)
     np.testing.assert_array_equal(clip.states, vectors(12, 14, seed=2)[[1, 3, 5]].astype(np.float32))
     np.testing.assert_array_equal(clip.actions, vectors(12, 16, seed=52)[[2, 4]].astype(np.float32))
-    some = open_source(vector_config(folder, source="lerobot", lerobot=lerobot | {"select": [13, 0]}))
-    np.testing.assert_array_equal(some.read(0).states, vectors(12, 14, seed=0)[:, [13, 0]].astype(np.float32))
-    wrong = vector_config(folder, source="lerobot", lerobot=lerobot | {"action": ["actions"]}, **recorded_by("last"))
+    selecting = open_source(vector_config(folder, source="lerobot", lerobot=lerobot | {"select": [13, 0]}))
+    np.testing.assert_array_equal(selecting.read(0).states, vectors(12, 14, seed=0)[:, [13, 0]].astype(np.float32))
+    mistyped = vector_config(
+        folder, source="lerobot", lerobot=lerobot | {"action": ["actions"]}, **join_recorded("last")
+    )
     with pytest.raises(InputError, match=r"data\.lerobot\.action.*Did you mean action"):
-        open_dataset(wrong)
+        open_dataset(mistyped)
 
 
 def test_episode_of_another_width_is_broken(tmp_path: Path) -> None:
@@ -117,10 +119,10 @@ def test_episode_of_another_width_is_broken(tmp_path: Path) -> None:
 def test_missing_or_short_recorded_commands_raise(tmp_path: Path) -> None:
     write_vectors(tmp_path / "none", width=8)
     with pytest.raises(InputError, match=r"actions: no such array"):
-        open_dataset(vector_config(tmp_path / "none", **recorded_by("sum")))
+        open_dataset(vector_config(tmp_path / "none", **join_recorded("sum")))
     write_vectors(tmp_path / "few", width=8, actions=np.zeros((23, 3)))
     with pytest.raises(InputError, match=r"actions: shape \(23, 3\).*24 x any"):
-        open_dataset(vector_config(tmp_path / "few", **recorded_by("sum")))
+        open_dataset(vector_config(tmp_path / "few", **join_recorded("sum")))
 
 
 @pytest.mark.parametrize(
@@ -145,14 +147,16 @@ def test_vector_config_that_needs_poses_or_is_incomplete_raises(changes: dict[st
         parse_config({"run_dir": "r", "model": {"base": "b"}, "data": values}, where="here")
 
 
-FIVE = Spaces.from_widths(Widths(5, 5), "difference")
+FIVE_NUMBERS = Spaces.from_widths(Widths(5, 5), "difference")
 
 
 def batch(states: np.ndarray, actions: np.ndarray | None = None) -> Batch:
-    numbers = states.astype(np.float32)[None]
-    taken = np.diff(numbers, axis=1) if actions is None else actions.astype(np.float32)[None]
+    state_numbers = states.astype(np.float32)[None]
+    differences = np.diff(state_numbers, axis=1) if actions is None else actions.astype(np.float32)[None]
     frames = torch.randint(0, 255, (1, len(states), 4, 4, 3), generator=torch.Generator().manual_seed(0))
-    return Batch(frames.to(torch.uint8), torch.from_numpy(numbers), torch.from_numpy(taken), None, ("e",), (0,))
+    return Batch(
+        frames.to(torch.uint8), torch.from_numpy(state_numbers), torch.from_numpy(differences), None, ("e",), (0,)
+    )
 
 
 @pytest.mark.parametrize(
@@ -165,18 +169,18 @@ def batch(states: np.ndarray, actions: np.ndarray | None = None) -> Batch:
     ],
 )
 def test_check_reports_constant_states_and_zero_actions(states: np.ndarray, about: str, level: str, words: str) -> None:
-    found = {one.about: one for one in batch_findings([batch(states)], FIVE)}
-    assert found[about].level == level
-    assert words in found[about].text
+    findings = {finding.about: finding for finding in batch_findings([batch(states)], FIVE_NUMBERS)}
+    assert findings[about].level == level
+    assert words in findings[about].text
 
 
 @pytest.mark.usefixtures("drawn")
-def test_inspection_of_vector_states(tmp_path: Path) -> None:
+def test_inspection_reports_a_range_for_each_number_of_a_vector(tmp_path: Path) -> None:
     dataset = open_dataset(vector_config(write_vectors(tmp_path / "set", width=14)))
-    found = inspect_dataset(dataset)
-    figures = json.loads(json.dumps(found.values))
-    assert len(figures["ranges"]) == 14
-    assert "gripper" not in figures
-    assert [one["stride"] for one in figures["per_model_step"]] == [3, 5, 10]
-    assert found.summary["states"].startswith("14 numbers: -")
-    assert plot_dataset(found, tmp_path / "sheet.png").stat().st_size > 10_000
+    inspection = inspect_dataset(dataset)
+    metrics = json.loads(json.dumps(inspection.values))
+    assert len(metrics["ranges"]) == 14
+    assert "gripper" not in metrics
+    assert [candidate["stride"] for candidate in metrics["per_model_step"]] == [3, 5, 10]
+    assert inspection.summary["states"].startswith("14 numbers: -")
+    assert plot_dataset(inspection, tmp_path / "sheet.png").stat().st_size > 10_000

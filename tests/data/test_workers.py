@@ -1,4 +1,4 @@
-"""Loader workers: a run never waits forever, shared memory is checked, and imports are safe."""
+"""Loader workers: a run never waits forever, and shared memory is checked."""
 
 import contextlib
 import signal
@@ -25,7 +25,7 @@ Usage = namedtuple("Usage", "free")
 
 @pytest.fixture
 def shared_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
-    """Set the free bytes of shared memory."""
+    """Return a function that sets the free bytes of shared memory."""
     monkeypatch.setattr(loader, "SHARED_MEMORY", tmp_path)
     real = loader.shutil.disk_usage
 
@@ -114,6 +114,3 @@ def test_slow_batch_is_awaited_unless_a_stop_signal_arrived(monkeypatch: pytest.
     monkeypatch.setattr(loader, "_GRACE_S", 0.0)
     with pytest.raises(UnreachableError, match="no batch arrived after SIGTERM"):
         loader._next_result(Slow(), ())
-
-
-# Files in the working directory that are named like modules.

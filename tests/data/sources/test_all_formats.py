@@ -1,4 +1,4 @@
-"""All data formats: one trajectory gives the same clips in the same order."""
+"""All data formats: the same recordings give the same clips in the same order."""
 
 import errno
 import itertools
@@ -43,13 +43,13 @@ MOTION = {
 
 
 @pytest.fixture(scope="module")
-def forms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data_sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the same four episodes in every format; their identities differ, but not their order."""
     root = tmp_path_factory.mktemp("forms")
-    drawn = [synthetic_episode(number, steps=steps, size=SIZE) for number, steps in enumerate(LENGTHS)]
-    write_droid_rlds(root / "rlds" / "1.0.0", drawn, shards=2)
+    episodes = [synthetic_episode(number, steps=steps, size=SIZE) for number, steps in enumerate(LENGTHS)]
+    write_droid_rlds(root / "rlds" / "1.0.0", episodes, shards=2)
     recorded = []
-    for number, episode in enumerate(drawn):
+    for number, episode in enumerate(episodes):
         states = measured_states(episode).astype(np.float32)
         velocities = np.asarray(episode.arrays["action_dict/joint_velocity"], np.float32)
         frames = [draw_frame(state, size=SIZE) for state in states]
@@ -70,13 +70,15 @@ def forms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def data_config(form: str, path: str, **values: Any) -> DataConfig:
+def data_config(data_format: str, path: str, **values: Any) -> DataConfig:
     chosen = {"frames": 3, "stride": 2, "workers": 0, "validation_share": 0.0, "test_share": 0.0} | values
-    return DataConfig(source=form.split("_v", maxsplit=1)[0], path=path, **chosen)
+    return DataConfig(source=data_format.split("_v", maxsplit=1)[0], path=path, **chosen)
 
 
-def open_format(forms: Path, form: str, **values: Any) -> Dataset:
-    return open_dataset(data_config(form, str(forms / form / ("1.0.0" if form == "rlds" else "")), **values))
+def open_format(data_sets: Path, data_format: str, **values: Any) -> Dataset:
+    return open_dataset(
+        data_config(data_format, str(data_sets / data_format / ("1.0.0" if data_format == "rlds" else "")), **values)
+    )
 
 
 def clips(dataset: Dataset, count: int) -> tuple[list[tuple[int, int]], list[Batch]]:
@@ -86,40 +88,40 @@ def clips(dataset: Dataset, count: int) -> tuple[list[tuple[int, int]], list[Bat
     return [(ranks[n], s) for b in batches for n, s in zip(b.episode_ids, b.starts, strict=True)], batches
 
 
-@pytest.mark.parametrize("form", FORMATS[1:])
-def test_all_formats_give_the_same_clips_in_the_same_order(forms: Path, form: str) -> None:
-    expected_order, expected = clips(open_format(forms, "rlds"), 16)
-    order, found = clips(open_format(forms, form), 16)
+@pytest.mark.parametrize("data_format", FORMATS[1:])
+def test_all_formats_give_the_same_clips_in_the_same_order(data_sets: Path, data_format: str) -> None:
+    expected_order, expected = clips(open_format(data_sets, "rlds"), 16)
+    order, batches = clips(open_format(data_sets, data_format), 16)
     assert order == expected_order
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one.states, other.states)
-        np.testing.assert_array_equal(one.actions, other.actions)
-        assert one.frames.shape == other.frames.shape
-        assert abs(one.frames.int() - other.frames.int()).float().mean() < 8, "more than a codec loses"
+    for batch, expected_batch in zip(batches, expected, strict=True):
+        np.testing.assert_array_equal(batch.states, expected_batch.states)
+        np.testing.assert_array_equal(batch.actions, expected_batch.actions)
+        assert batch.frames.shape == expected_batch.frames.shape
+        assert abs(batch.frames.int() - expected_batch.frames.int()).float().mean() < 8, "more than the loss of a codec"
 
 
-@pytest.mark.parametrize("form", FORMATS[1:])
-def test_idle_filter_selects_the_same_steps_in_all_formats(forms: Path, form: str) -> None:
-    rules = [MOTION] if form == "npz" else [MOTION, COMMANDS]  # .npz has no commanded velocities
+@pytest.mark.parametrize("data_format", FORMATS[1:])
+def test_idle_filter_selects_the_same_steps_in_all_formats(data_sets: Path, data_format: str) -> None:
+    rules = [MOTION] if data_format == "npz" else [MOTION, COMMANDS]  # .npz has no commanded velocities
     for rule in rules:
-        expected, found = open_format(forms, "rlds", idle=rule), open_format(forms, form, idle=rule)
+        expected, dataset = open_format(data_sets, "rlds", idle=rule), open_format(data_sets, data_format, idle=rule)
         assert 0 < expected.selected_steps.num_steps < sum(LENGTHS)
         by_rank = [
-            [dataset.selected_steps.ranges_of(episode) for episode in np.argsort(dataset.table.id_rank).tolist()]
-            for dataset in (expected, found)
+            [opened.selected_steps.ranges_of(episode) for episode in np.argsort(opened.table.id_rank).tolist()]
+            for opened in (expected, dataset)
         ]
         assert by_rank[0] == by_rank[1]
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("data_format", FORMATS)
 def test_data_set_is_indexed_once_for_equivalent_paths(
-    forms: Path, form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data_sets: Path, data_format: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "link").symlink_to(forms)
-    monkeypatch.chdir(forms)
+    (tmp_path / "link").symlink_to(data_sets)
+    monkeypatch.chdir(data_sets)
     tables = [
-        open_format(root, form, disk_cache={"dir": str(tmp_path / "cache")}).table
-        for root in (forms, Path(), tmp_path / "link")
+        open_format(root, data_format, disk_cache={"dir": str(tmp_path / "cache")}).table
+        for root in (data_sets, Path(), tmp_path / "link")
     ]
     assert [list(table) for table in tables] == [list(tables[0])] * 3
     assert len(list((tmp_path / "cache/index").glob("*.index"))) == 1
@@ -129,40 +131,40 @@ def test_data_set_is_indexed_once_for_equivalent_paths(
 def without_permission(folder: Path) -> Iterator[None]:
     """Remove the read permission of all files in a folder."""
     files = [path for path in folder.rglob("*") if path.is_file()]
-    root = os.geteuid() == 0
+    is_root = os.geteuid() == 0
     try:
         for path in files:
             path.chmod(0)
-        if root:  # root may read all files
+        if is_root:  # root may read all files
             os.seteuid(65534)
         yield
     finally:
-        if root:
+        if is_root:
             os.seteuid(0)
         for path in files:
             path.chmod(0o644)
 
 
-@pytest.mark.parametrize("form", FORMATS)
-def test_file_without_permission_raises_unreachable_error(forms: Path, form: str, tmp_path: Path) -> None:
-    shutil.copytree(forms / form, tmp_path / form)
-    for folder in (tmp_path, *tmp_path.parents):  # a test that is run by root switches to an unprivileged user
-        if folder.owner() == forms.owner() and folder.is_relative_to(tempfile.gettempdir()):
+@pytest.mark.parametrize("data_format", FORMATS)
+def test_file_without_permission_raises_unreachable_error(data_sets: Path, data_format: str, tmp_path: Path) -> None:
+    shutil.copytree(data_sets / data_format, tmp_path / data_format)
+    for folder in (tmp_path, *tmp_path.parents):  # if root runs the test, it switches to an unprivileged user
+        if folder.owner() == data_sets.owner() and folder.is_relative_to(tempfile.gettempdir()):
             folder.chmod(0o755)
     (tmp_path / "new").mkdir()
     (tmp_path / "new").chmod(0o777)
     before, new = ({"dir": str(tmp_path / name), "limit_gb": 0.0} for name in ("before", "new"))
-    source = open_format(tmp_path, form, disk_cache=before).source
+    source = open_format(tmp_path, data_format, disk_cache=before).source
     frames = source.read(0).read_frames
-    with without_permission(tmp_path / form):
+    with without_permission(tmp_path / data_format):
         for action in (
             lambda: source.read(0),
             lambda: frames([0]),
-            lambda: open_format(tmp_path, form, disk_cache=new),
+            lambda: open_format(tmp_path, data_format, disk_cache=new),
         ):
             with pytest.raises(UnreachableError, match=f"{os.strerror(errno.EACCES)}.*permissions"):
                 action()
-    assert len(open_format(tmp_path, form, disk_cache=new).table) == len(LENGTHS)
+    assert len(open_format(tmp_path, data_format, disk_cache=new).table) == len(LENGTHS)
 
 
 CallSite = tuple[str, ...]
@@ -181,12 +183,12 @@ def run_all_readers(dataset: Dataset) -> None:
     inspect_dataset(dataset)
 
 
-@pytest.mark.parametrize("form", [form for form in FORMATS if form != "lerobot_v2.1"])
+@pytest.mark.parametrize("data_format", [data_format for data_format in FORMATS if data_format != "lerobot_v2.1"])
 def test_unreachable_storage_raises_from_every_call_site(
-    forms: Path, form: str, gcs: Gcs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data_sets: Path, data_format: str, gcs: Gcs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A network failure at any call site raises UnreachableError and marks no episode as broken."""
-    gcs.upload(forms / form, f"robots/{form}")
+    gcs.upload(data_sets / data_format, f"robots/{data_format}")
     original, call_sites, failing = retries.call_with_retries, dict.fromkeys(()), [None]
 
     def call_or_fail(where: str, *args: Any, **kwargs: Any) -> Any:
@@ -202,8 +204,8 @@ def test_unreachable_storage_raises_from_every_call_site(
 
     def use(number: int) -> None:
         cache = {"dir": str(tmp_path / f"cache{number}"), "limit_gb": 0.0}
-        path = f"gs://robots/{form}{'/1.0.0' if form == 'rlds' else ''}"
-        run_all_readers(open_dataset(data_config(form, path, disk_cache=cache, **values)))
+        path = f"gs://robots/{data_format}{'/1.0.0' if data_format == 'rlds' else ''}"
+        run_all_readers(open_dataset(data_config(data_format, path, disk_cache=cache, **values)))
 
     use(0)
     assert len(call_sites) > 3

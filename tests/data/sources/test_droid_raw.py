@@ -1,4 +1,4 @@
-"""DROID's raw recordings: the same content as its RLDS."""
+"""DROID's raw recordings: states, frames, cameras, and errors of damaged episodes."""
 
 import pickle
 import re
@@ -21,7 +21,7 @@ from vjepa2_ac.media import video as video_reader
 
 STEPS, SIZE = 24, (72, 128)
 LEFT, RIGHT, WRIST = "23404442", "29838012", "16787047"
-PLACE = "LAB/success/2023-07-07/Fri_Jul__7_09:42:23_2023"
+IDENTITY = "LAB/success/2023-07-07/Fri_Jul__7_09:42:23_2023"
 STATES = synthetic_states(STEPS)
 FRAMES = {
     serial: [draw_frame(state, size=SIZE, camera=camera) for state in STATES]
@@ -29,16 +29,16 @@ FRAMES = {
 }
 
 
-def write(root: Path, place: str = PLACE, **changes: Any) -> Path:
-    return write_raw_droid(root / place, STATES, **{"pictures": FRAMES, "gop": 8, **changes})
+def write(root: Path, folder: str = IDENTITY, **changes: Any) -> Path:
+    return write_raw_droid(root / folder, STATES, **{"pictures": FRAMES, "gop": 8, **changes})
 
 
 def source(path: Path, **values: Any) -> RawDroidSource:
     return RawDroidSource(DataConfig(source="droid_raw", path=str(path), **values))
 
 
-def psnr(one: np.ndarray, other: np.ndarray) -> float:
-    return float(10 * np.log10(255**2 / np.mean((one.astype(float) - other) ** 2)))
+def psnr(first: np.ndarray, second: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / np.mean((first.astype(float) - second) ** 2)))
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_episode_has_measured_states_task_and_outcome(tree: Path) -> None:
     raw = source(tree)
     infos = raw.infos()
     assert [info.success for info in infos] == [False, True]
-    assert infos[1].id == PLACE
+    assert infos[1].id == IDENTITY
     episode = raw.read(1)
     np.testing.assert_array_equal(episode.states, STATES)
     assert (episode.control_rate_hz, episode.metadata) == (15.0, {"language": "move to place 0"})
@@ -73,9 +73,9 @@ def test_mistyped_camera_name_raises_with_a_suggestion(tmp_path: Path) -> None:
         source(tmp_path, camera="wirst").infos()
 
 
-@pytest.mark.parametrize("part", ["", "LAB", "LAB/success", PLACE])
+@pytest.mark.parametrize("part", ["", "LAB", "LAB/success", IDENTITY])
 def test_identity_is_independent_of_the_configured_subfolder(tree: Path, part: str) -> None:
-    assert PLACE in [info.id for info in source(tree / part).infos()]
+    assert IDENTITY in [info.id for info in source(tree / part).infos()]
 
 
 @pytest.mark.parametrize("frames", [STEPS - 1, STEPS, STEPS + 1])
@@ -91,13 +91,13 @@ def test_episode_length_is_limited_by_states_and_frames(tmp_path: Path, frames: 
 
 def test_steps_without_operator_are_dropped_with_their_frames(tmp_path: Path) -> None:
     skipped = [0, 5, 6]
-    kept = np.setdiff1d(np.arange(STEPS), skipped)
+    used_steps = np.setdiff1d(np.arange(STEPS), skipped)
     poses = np.arange(STEPS * 6.0).reshape(STEPS, 6) / 100
     write(tmp_path, skipped=skipped, extrinsics={LEFT: poses}, joint_velocities=np.ones((STEPS, 7)) * poses[:, :1])
     episode = source(tmp_path).read(0)
-    np.testing.assert_array_equal(episode.states, STATES[kept])
-    np.testing.assert_array_equal(episode.extrinsics, poses[kept])
-    np.testing.assert_array_equal(episode.joint_velocities[:, 3], poses[kept, 0])
+    np.testing.assert_array_equal(episode.states, STATES[used_steps])
+    np.testing.assert_array_equal(episode.extrinsics, poses[used_steps])
+    np.testing.assert_array_equal(episode.joint_velocities[:, 3], poses[used_steps, 0])
     assert psnr(episode.read_frames([0, 4])[1], FRAMES[LEFT][7]) > 30
 
 
@@ -120,21 +120,21 @@ def test_trajectory_and_video_are_parsed_once_per_machine(
     first = source(tmp_path / "raw", disk_cache=cache).read(0)
     frames = first.read_frames([3, 17])
     monkeypatch.setattr(h5py.h5f, "open_file_image", lambda _: pytest.fail("parsed again"))
-    packets, walked = video_reader._Video.packets, []
+    packets, times = video_reader._Video.packets, []
 
-    def counted(self: video_reader._Video, *given: int) -> Iterator[object]:
-        for packet in packets(self, *given):
-            walked.append(packet.pts)
+    def counted(self: video_reader._Video, *arguments: int) -> Iterator[object]:
+        for packet in packets(self, *arguments):
+            times.append(packet.pts)
             yield packet
 
     monkeypatch.setattr(video_reader._Video, "packets", counted)
-    again = source(tmp_path / "raw", disk_cache=cache).read(0)
-    np.testing.assert_array_equal(again.states, first.states)
-    np.testing.assert_array_equal(again.read_frames([3, 17]), frames)
-    assert len(walked) < STEPS
+    other = source(tmp_path / "raw", disk_cache=cache).read(0)
+    np.testing.assert_array_equal(other.states, first.states)
+    np.testing.assert_array_equal(other.read_frames([3, 17]), frames)
+    assert len(times) < STEPS
 
 
-def h5(change: Callable[[h5py.File], object]) -> Callable[[Path], object]:
+def change_trajectory(change: Callable[[h5py.File], object]) -> Callable[[Path], object]:
     def apply(folder: Path) -> None:
         with h5py.File(folder / "trajectory.h5", "r+") as file:
             change(file)
@@ -142,20 +142,20 @@ def h5(change: Callable[[h5py.File], object]) -> Callable[[Path], object]:
     return apply
 
 
-def put(name: str, value: Any) -> Callable[[Path], object]:
+def set_array(name: str, value: Any) -> Callable[[Path], object]:
     def change(file: h5py.File) -> None:
         if name in file:
             del file[name]
         if value is not None:
             file[name] = value
 
-    return h5(change)
+    return change_trajectory(change)
 
 
-def cut(name: str, share: float) -> Callable[[Path], object]:
+def cut(name: str, fraction: float) -> Callable[[Path], object]:
     def apply(folder: Path) -> None:
         (path,) = folder.glob(name)
-        path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+        path.write_bytes(path.read_bytes()[: int(path.stat().st_size * fraction)])
 
     return apply
 
@@ -169,15 +169,15 @@ BROKEN = {
     "no metadata": (lambda folder: next(folder.glob("*.json")).unlink(), "metadata"),
     "no video": (lambda folder: (folder / MP4).unlink(), f"{LEFT}.mp4: no such file"),
     "no key": (
-        put(GRIPPER, None),
+        set_array(GRIPPER, None),
         "gripper_position: no such array; group observation/robot_state contains cartesian_position",
     ),
-    "text for numbers": (put(POSE, np.full((STEPS, 6), b"x")), "kind"),
-    "shorter gripper": (put(GRIPPER, STATES[:-1, 6]), "gripper: values for 23 of 24 steps"),
-    "no steps": (put(POSE, np.zeros((0, 6))), "no steps"),
-    "not a number": (put(POSE, ONE_NAN), "step 3"),
-    "out of reach": (put(POSE, STATES[:, :6] + [6, 0, 0, 0, 0, 0]), "5 m"),
-    "all steps skipped": (put("observation/timestamp/skip_action", np.ones(STEPS, bool)), "no steps"),
+    "text for numbers": (set_array(POSE, np.full((STEPS, 6), b"x")), "kind"),
+    "shorter gripper": (set_array(GRIPPER, STATES[:-1, 6]), "gripper: values for 23 of 24 steps"),
+    "no steps": (set_array(POSE, np.zeros((0, 6))), "no steps"),
+    "not a number": (set_array(POSE, ONE_NAN), "step 3"),
+    "out of reach": (set_array(POSE, STATES[:, :6] + [6, 0, 0, 0, 0, 0]), "5 m"),
+    "all steps skipped": (set_array("observation/timestamp/skip_action", np.ones(STEPS, bool)), "no steps"),
     "cut trajectory": (cut("trajectory.h5", 0.5), "trajectory.h5: .*HDF5"),
     "cut metadata": (cut("*.json", 0.5), "invalid JSON"),
     "no such camera": (lambda folder: next(folder.glob("*.json")).write_text("{}"), "left_mp4_path"),
@@ -190,34 +190,24 @@ BROKEN = {
 def test_unusable_episode_is_a_problem_with_its_name_and_reason(tree: Path, tmp_path: Path, damage: str) -> None:
     root = shutil.copytree(tree, tmp_path / "raw")
     change, message = BROKEN[damage]
-    change(root / PLACE)
+    change(root / IDENTITY)
     infos = source(root).infos()
     assert len(infos) == 1
     (problem,) = infos.problems
-    assert problem.name == PLACE
+    assert problem.name == IDENTITY
     assert re.search(message, str(InputError(where=problem.where, found=problem.found, needed=problem.needed)))
     with pytest.raises(InputError, match=message):
-        source(root / PLACE).infos()
+        source(root / IDENTITY).infos()
 
 
 def test_remote_tree_equals_local_tree(tree: Path, gcs: Gcs, tmp_path: Path) -> None:
-    url, here = gcs.upload(tree, "bucket/droid_raw/1.0.1"), source(tree)
+    url, local = gcs.upload(tree, "bucket/droid_raw/1.0.1"), source(tree)
     raw = source(url, disk_cache={"dir": str(tmp_path)})
-    assert list(raw.infos()) == list(here.infos())
-    episode, same = raw.read(1), here.read(1)
+    assert list(raw.infos()) == list(local.infos())
+    episode, same = raw.read(1), local.read(1)
     np.testing.assert_array_equal(episode.states, same.states)
     np.testing.assert_array_equal(episode.read_frames([3, 20]), same.read_frames([3, 20]))
     gcs.forget()
-    infos = pickle.loads(pickle.dumps(raw))  # noqa: S301 - our own
-    np.testing.assert_array_equal(infos.read(1).read_frames([7]), same.read_frames([7]))
+    unpickled = pickle.loads(pickle.dumps(raw))  # noqa: S301 - our own bytes
+    np.testing.assert_array_equal(unpickled.read(1).read_frames([7]), same.read_frames([7]))
     assert gcs.requests == []  # the content and the length of the video are cached
-
-
-@pytest.fixture(scope="module")
-def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return an episode whose video has megabytes, because noise does not compress."""
-    chance = np.random.default_rng(0)
-    noise = [chance.integers(0, 256, (144, 256, 3), np.uint8) for _ in range(3)]
-    root = tmp_path_factory.mktemp("noisy")
-    write_raw_droid(root / PLACE, synthetic_states(90), pictures={LEFT: noise * 30}, gop=10)
-    return root

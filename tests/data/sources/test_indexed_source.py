@@ -36,10 +36,10 @@ def write_npz(folder: Path, episodes: int) -> NpzData:
 class EveryOther(IndexedSource[DataConfig, NpzSource]):
     """Every other episode of another source."""
 
-    looks = 0
+    times_opened = 0
 
     def _open_data_set(self, progress: Progress) -> tuple[EpisodeTable, NpzSource]:
-        type(self).looks += 1
+        type(self).times_opened += 1
         inner = NpzSource(self._config)
         return EpisodeTable.from_infos(list(inner.infos(progress))[::2]), inner
 
@@ -50,12 +50,12 @@ class EveryOther(IndexedSource[DataConfig, NpzSource]):
 def run_together(*tasks: Callable[[], T]) -> list[T]:
     """Return the results of tasks that run in separate threads; fail if a result is missing after 20 s."""
     results: list[T] = []
-    threads = [threading.Thread(target=lambda one=task: results.append(one()), daemon=True) for task in tasks]
+    threads = [threading.Thread(target=lambda task=task: results.append(task()), daemon=True) for task in tasks]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(20)
-    assert len(results) == len(tasks), "some wait for a lock"
+    assert len(results) == len(tasks), "a task still waits for a lock"
     return results
 
 
@@ -64,11 +64,11 @@ def test_nested_source_opens_and_is_pickled_with_its_index(tmp_path: Path) -> No
     [table] = run_together(source.infos)
     assert [info.id for info in table] == ["0", "2", "4"]
     assert source.read(1).read_frames([3]).max() == 2
-    EveryOther.looks = 0
+    EveryOther.times_opened = 0
     copy = pickle.loads(pickle.dumps(source))  # noqa: S301 - our own bytes
     assert [info.id for info in run_together(copy.infos)[0]] == ["0", "2", "4"]
     assert copy.read(2).read_frames([0]).max() == 4
-    assert EveryOther.looks == 0, "the index is pickled"
+    assert EveryOther.times_opened == 0, "the index is pickled"
 
 
 # ---- identities ----
@@ -76,8 +76,8 @@ def test_nested_source_opens_and_is_pickled_with_its_index(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("identity", ["a\0", "\0", "a\0b"])
 def test_identity_with_nul_character_is_a_problem_of_that_episode(identity: str, tmp_path: Path) -> None:
-    found = [IndexEntry(EpisodeInfo(name, 30), f"file {name!r}") for name in ("a", identity, "é")]
-    table = build_table(found, DataConfig(path=str(tmp_path)), 3)
+    entries = [IndexEntry(EpisodeInfo(name, 30), f"file {name!r}") for name in ("a", identity, "é")]
+    table = build_table(entries, DataConfig(path=str(tmp_path)), 3)
     assert [info.id for info in table] == ["a", "é"]
     [problem] = table.problems
     assert problem.name == identity

@@ -1,4 +1,4 @@
-"""A git-lfs pointer in place of a file raises an error that names it, in every format, locally and behind a URL."""
+"""A git-lfs pointer instead of a file raises an error with its path, in every format, locally and behind a URL."""
 
 from pathlib import Path
 
@@ -12,12 +12,12 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 12345678\n"
-FORMS = WRITERS | {
+DATA_FORMATS = WRITERS | {
     "lerobot v2.1": lambda folder, numbers: write_v21(folder, [recorded(number, STEPS) for number in numbers])
 }
 
 
-def replaced_by_pointers(folder: Path, pattern: str) -> Path:
+def replace_by_pointers(folder: Path, pattern: str) -> Path:
     """Replace the files that match a pattern with git-lfs pointers."""
     files = [*folder.rglob(pattern)]
     assert files
@@ -26,14 +26,14 @@ def replaced_by_pointers(folder: Path, pattern: str) -> Path:
     return folder
 
 
-def config_of(form: str, path: str | Path, tmp_path: Path) -> DataConfig:
-    source = form.split(maxsplit=1)[0]
+def config_of(data_format: str, path: str | Path, tmp_path: Path) -> DataConfig:
+    source = data_format.split(maxsplit=1)[0]
     values = {"source": source, "path": str(path), "frames": 3, "stride": 2, "disk_cache": {"dir": str(tmp_path)}}
     return DataConfig.model_validate(values)
 
 
 @pytest.mark.parametrize(
-    ("form", "pattern"),
+    ("data_format", "pattern"),
     [
         ("rlds", "*.tfrecord-*"),
         ("rlds", "*.tfrecord-00001-*"),
@@ -49,16 +49,16 @@ def config_of(form: str, path: str | Path, tmp_path: Path) -> DataConfig:
         ("droid_raw", "metadata_*.json"),
     ],
 )
-def test_lfs_pointer_raises_when_the_data_set_is_opened(form: str, pattern: str, tmp_path: Path) -> None:
-    folder = replaced_by_pointers(FORMS[form](tmp_path / "set", range(3)), pattern)
+def test_lfs_pointer_raises_when_the_data_set_is_opened(data_format: str, pattern: str, tmp_path: Path) -> None:
+    folder = replace_by_pointers(DATA_FORMATS[data_format](tmp_path / "set", range(3)), pattern)
     with pytest.raises(InputError, match=r"a git-lfs pointer.*`git lfs pull`") as raised:
-        open_dataset(config_of(form, folder, tmp_path / "cache"))
+        open_dataset(config_of(data_format, folder, tmp_path / "cache"))
     where = raised.value.where.split(": ")[0]
     assert Path(where).read_bytes() == POINTER
 
 
-@pytest.mark.parametrize(("form", "pattern"), [("rlds", "*.tfrecord-*"), ("lerobot", "*.mp4"), ("npz", "*.npz")])
-def test_remote_lfs_pointer_raises(form: str, pattern: str, gcs: Gcs, tmp_path: Path) -> None:
-    gcs.upload(replaced_by_pointers(FORMS[form](tmp_path / "set", range(3)), pattern), "robots/set")
+@pytest.mark.parametrize(("data_format", "pattern"), [("rlds", "*.tfrecord-*"), ("lerobot", "*.mp4"), ("npz", "*.npz")])
+def test_remote_lfs_pointer_raises(data_format: str, pattern: str, gcs: Gcs, tmp_path: Path) -> None:
+    gcs.upload(replace_by_pointers(DATA_FORMATS[data_format](tmp_path / "set", range(3)), pattern), "robots/set")
     with pytest.raises(InputError, match=r"gs://robots/set/.*a git-lfs pointer"):
-        open_dataset(config_of(form, "gs://robots/set", tmp_path / "cache"))
+        open_dataset(config_of(data_format, "gs://robots/set", tmp_path / "cache"))
