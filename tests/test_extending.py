@@ -88,7 +88,7 @@ def test_options_and_names_are_checked_when_the_config_is_read(at_home: Path, ma
         ("training.loss=log_cosch", "Did you mean log_cosh?"),
         ("training.loss.options={scale: much}", "scale"),
         ("planning.energy.distance=larges", "Did you mean largest?"),
-        ("planning.planner.options={a: 1}", "known here: start_std, elites"),
+        ("planning.planner.options={a: 1}", "available: start_std, elites"),
     )
     for override, told in wrong:
         words = ["config", "show", "own.yaml", "--plugin", "my_module", "training.loss=log_cosh", override]

@@ -170,7 +170,7 @@ def _located(error: ValidationError, section: type[BaseModel], at: tuple[str, ..
     for detail in error.errors(include_url=False):
         kind, text, location = detail["type"], detail["msg"], detail["loc"]
         if kind == "extra_forbidden":
-            known = f"known here: {', '.join(section.model_fields)}"
+            known = f"available: {', '.join(section.model_fields)}"
             suggestion = did_you_mean(str(location[-1]), section.model_fields)
             kind, text = UNKNOWN_OPTION, f"unknown key; {f'd{suggestion[1:-1]}' if suggestion else known}"
         custom = PydanticCustomError(kind, text)

@@ -56,7 +56,7 @@ def test_mistyped_camera_gets_a_suggestion() -> None:
 
 def test_unknown_key_error_lists_existing_keys_without_a_close_match() -> None:
     (line,) = error_lines("tracking.zzz=1")
-    assert re.search(r"known here: tensorboard, wandb", line)
+    assert re.search(r"available: tensorboard, wandb", line)
 
 
 @pytest.mark.parametrize(

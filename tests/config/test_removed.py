@@ -152,7 +152,7 @@ def test_component_options_are_set_with_overrides() -> None:
     assert config_as_dict(default)["planning"]["planner"] == "cem", "an option with its default value must not be saved"
     with pytest.raises(InputError, match=r"planning.planner.options.elite: unknown key; did you mean elites"):
         parse_config(VALUES, ["planning.planner.options.elite=20"], where="mine.yaml")
-    with pytest.raises(InputError, match=r"planning.planner: a name, or {name: NAME, options"):
+    with pytest.raises(InputError, match=r"planning.planner: Input should be a name, or {name: NAME, options"):
         parse_config(VALUES, ["planning.planner={elites: 20}"], where="mine.yaml")
 
 

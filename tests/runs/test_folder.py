@@ -26,8 +26,8 @@ from vjepa2_ac.runs.folder import (
     check_run_folder,
     list_remote_locations,
     open_run_folder,
+    read_or_create_run_id,
     read_run_config,
-    run_id,
 )
 from vjepa2_ac.runs.open_run import open_run
 from vjepa2_ac.training import loop
@@ -80,7 +80,7 @@ def test_invalid_small_files_of_a_run_raise_input_errors(tmp_path: Path, make_co
     for text in ("../../x", "a b", "x" * 10_000, "\x1b[2J"):
         (tmp_path / "run_id").write_text(text)
         with pytest.raises(InputError, match="run_id"):
-            run_id(tmp_path)
+            read_or_create_run_id(tmp_path)
 
 
 # The lock

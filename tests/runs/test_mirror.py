@@ -198,7 +198,7 @@ def test_upload_that_exceeds_its_time_is_reported_and_abandoned(
     write(run, 10)
     mirror = mirror_of(run, remote_wait_seconds=0.2)
     mirror.finish(lambda: held.waiting.is_set())
-    assert f"Later ones in {run / 'checkpoints'} are only on this machine, because the time" in caplog.text
+    assert f"Later checkpoints in {run / 'checkpoints'} are only on this machine, because the time" in caplog.text
     assert mirror.is_uploading
     held.opened.set()
     mirror._thread.join()

@@ -40,7 +40,7 @@ def test_run_with_image_strips_equals_a_run_without_bit_for_bit(
     make_config, reporter, whole_run, decoder, monkeypatch
 ) -> None:
     sent = []
-    monkeypatch.setattr(MetricsLog, "show", lambda _, *args: sent.append(args))
+    monkeypatch.setattr(MetricsLog, "log_image", lambda _, *args: sent.append(args))
     run = train(make_config(validation__decoder=decoder), reporter)
     assert_same_run(whole_run, run)
     assert names(run) == STRIPS

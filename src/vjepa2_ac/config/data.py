@@ -30,7 +30,7 @@ _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name
 
 Split = Literal["train", "validation", "test"]
 RotationFormat = Literal["euler_xyz", "euler_xyz_degrees", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw"]
-_JOINED = "to sum (deltas), mean (velocities) or last (absolute targets)"
+_JOIN_OPTIONS = "to sum (deltas), mean (velocities) or last (absolute targets)"
 
 
 def _validate_split_by(text: str) -> str:
@@ -43,9 +43,11 @@ def _validate_split_by(text: str) -> str:
     try:
         groups = re.compile(text).groups
     except (re.error, OverflowError, RecursionError) as error:
-        raise ValueError(f"{text!r} is no regular expression ({error})") from None
+        raise ValueError(f"{text!r} is not a regular expression ({error})") from None
     if groups != 1:
-        raise ValueError(f"{text!r} has {groups} groups; name a field, or put what episodes share in one group: (...)")
+        raise ValueError(
+            f"{text!r} has {groups} groups; set a field, or a regular expression with exactly one group: (...)"
+        )
     return text
 
 
@@ -68,9 +70,9 @@ class IdleConfig(Section):
     gripper: Positive = 1e-2
     """For rule motion: the limit of the gripper's change of closedness (0 to 1)."""
     shortest_idle_steps: PositiveInt = 7
-    """Shorter idle ranges are kept."""
+    """Idle ranges with fewer steps are kept."""
     shortest_kept_steps: PositiveInt = 16
-    """Shorter ranges between idle ranges are removed, too."""
+    """Moving ranges with fewer steps are removed as well."""
     cut_last_steps: Count = 10
     """Number of steps cut from the end of each remaining range."""
 
@@ -140,7 +142,7 @@ class DataConfig(Section):
     has_camera_poses: ClassVar[bool] = True
     has_vectors: ClassVar[bool] = True  # whether `states: vector` is possible
     same_identity_fix: ClassVar[str] = ""  # the fix in the error about two episodes with the same identity
-    constants: ClassVar[dict[str, dict[str, Any]]] = {}  # options of 0.1 that are part of the keys of caches
+    constants: ClassVar[dict[str, dict[str, Any]]] = {}  # removed options of version 0.1 that are part of cache keys
 
     source: str
     """Format of the data set."""
@@ -152,10 +154,11 @@ class DataConfig(Section):
     first camera, for DROID the left exterior camera, with which the released weights were trained. rlds, lerobot: a
     name in `cameras`. droid_raw: left, right, wrist, ext1, ext2 or a serial number. npz: an array with frames."""
     states: Literal["pose", "vector"] = "pose"
-    """Kind of state. pose: 7 numbers (position, rotation, gripper), as in the released weights. vector: the source's
-    numbers, unchanged and of any width, for other robots: two arms, joints, a mobile base."""
+    """Kind of state. pose: 7 numbers (position, rotation, gripper), as in the released weights. vector: the numbers
+    of the data set, unchanged and of any width, for other robots: two arms, joints, a mobile base."""
     actions: Literal["difference", "recorded"] = "difference"
-    """difference: the change from a state to the next. recorded: the source's commands, of any width; for vectors."""
+    """difference: the change from each state to the next. recorded: the commands in the data set, of any width; for
+    `states: vector`."""
     join_actions: Annotated[Literal["sum", "mean", "last"] | None, Affects.MEASURED | Affects.RUN] = None
     """How the recorded commands of the control steps in a model step are combined into one action. sum: for deltas.
     mean: for velocities. last: for absolute targets. Required unless `stride` is 1."""
@@ -166,7 +169,7 @@ class DataConfig(Section):
     candidates. auto: before the first step, the one with the model's lowest error relative to persistence is chosen
     from 4, 8 and 15 at 15 control steps per second, scaled to other rates."""
     start_every: PositiveInt = 1
-    """Clips start at multiples of this many control steps, counted from the first step of their episode that
+    """Number of control steps between possible starts of clips, counted from the first step of the episode that
     `data.idle` keeps. If it equals `stride`, only every stride-th frame is needed, and a latent cache is smaller."""
     validation_share: Annotated[Share, Affects.RUN] = 0.05
     """Share of the episodes held out for validation, by a hash of their identity; with three episodes or more at least
@@ -175,8 +178,8 @@ class DataConfig(Section):
     """Share of the episodes held out for `evaluate`, drawn as for validation; not used in training or validation."""
     splits: Annotated[Literal["dataset", "hash"], Affects.RUN] = "dataset"
     """How the splits defined by the data set are used, if there are several (RLDS, LeRobot). dataset: train, val (or
-    valid, validation) and test are used as such; a missing one is drawn from train by its share, and splits of other
-    names belong to train. hash: all episodes are pooled, and the splits are drawn from them by the shares."""
+    valid, validation) and test are used as such; a missing split is drawn from train by its share, and splits
+    with other names belong to train. hash: all episodes are pooled, and the splits are drawn by the shares."""
     split_by: Annotated[
         Annotated[str, Field(max_length=500), AfterValidator(_validate_split_by)] | None, Affects.RUN
     ] = None
@@ -247,10 +250,11 @@ class DataConfig(Section):
 
     @model_validator(mode="after")
     def _parts_fit(self) -> DataConfig:
-        known, cameras = self.known_cameras, self.cameras
-        unknown = [camera for camera in cameras if known is not None and camera not in known]
-        available = f"{did_you_mean(unknown[0], known or ())}Available: {', '.join(known or ())}" if unknown else ""
-        splits, is_camera_frame = self.validation_share + self.test_share, self.pose_frame == "camera"
+        known_cameras, cameras = self.known_cameras, self.cameras
+        unknown = [camera for camera in cameras if known_cameras is not None and camera not in known_cameras]
+        names = known_cameras or ()
+        available = f"{did_you_mean(unknown[0], names)}Available: {', '.join(names)}" if unknown else ""
+        held_out_share, is_camera_frame = self.validation_share + self.test_share, self.pose_frame == "camera"
         return self.check_rules(
             (
                 not cameras,
@@ -269,7 +273,7 @@ class DataConfig(Section):
                 self.transforms and self.uses_cached_latents,
                 "transforms change frames, but not cached latents. Remove transforms, or set cache: off",
             ),
-            (splits >= 1.0, "validation_share and test_share leave nothing to train on"),
+            (held_out_share >= 1.0, "validation_share and test_share leave nothing to train on"),
             (
                 is_camera_frame and not self.has_camera_poses,
                 f"pose_frame: source {self.source} has no camera poses. Set pose_frame: base",
@@ -292,9 +296,9 @@ class DataConfig(Section):
             (is_vector and used, f"{', '.join(used)}: only for poses, and states is vector"),
             (
                 is_recorded and not is_vector,
-                "actions: recorded needs states: vector, because the action of a pose is its difference",
+                "actions: recorded needs states: vector, because the action of poses is their difference",
             ),
-            (needs_join, f"actions: recorded at stride {self.stride} needs join_actions. Set it {_JOINED}"),
+            (needs_join, f"actions: recorded at stride {self.stride} needs join_actions. Set it {_JOIN_OPTIONS}"),
             (not is_recorded and self.join_actions is not None, "join_actions is only for actions: recorded"),
         )
 
@@ -302,7 +306,7 @@ class DataConfig(Section):
     def detect(cls, path: str) -> dict[str, Any] | None:  # noqa: ARG003 - used by subclasses
         """Return the values that `vjepa2-ac init` writes for a folder of this data format; None for other folders.
 
-        They are the keys of this section except source and path, and `control_rate_hz`, the control steps per second.
+        They are the keys of this section without source and path, and `control_rate_hz`, the control steps per second.
         """
         return None
 
@@ -336,8 +340,8 @@ class DataConfig(Section):
 
     def with_source(self, source: str, **changes: Any) -> DataConfig:
         """Return a config of another data format with the common keys of this one and `changes`, without validation."""
-        same = {name: getattr(self, name) for name in DataConfig.model_fields}
-        return self.kinds[source].model_construct(**{**same, "source": source, **changes})
+        common = {name: getattr(self, name) for name in DataConfig.model_fields}
+        return self.kinds[source].model_construct(**{**common, "source": source, **changes})
 
     @classmethod
     def format_sections(cls) -> dict[str, type[Section]]:

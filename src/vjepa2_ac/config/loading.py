@@ -28,7 +28,7 @@ from vjepa2_ac.storage import read_small_file
 from vjepa2_ac.storage.paths import BUILTIN, NO_DATA
 from vjepa2_ac.storage.structured import describe_validation_error, parse_yaml
 
-_MOST_BYTES = 1_000_000  # size limit of a config file: PyYAML needs a minute for 20 MB
+_MAX_BYTES = 1_000_000  # size limit of a config file: PyYAML needs a minute for 20 MB
 # Cached because a command reads the config of its run several times, which takes 20 ms each. `parse_config` copies the
 # values, so that the cached ones do not change.
 _parse_document = lru_cache(maxsize=8)(parse_yaml)
@@ -55,8 +55,8 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
     if isinstance(config, Mapping):
         return parse_config(config, overrides, where="load_config")
     path = config_path(config)
-    is_of_run = any((path.parent / name).exists() for name in _RUN_FILES)
-    return parse_config(_read_yaml(path), overrides, where=str(config), local_plugins=not is_of_run)
+    is_in_run_folder = any((path.parent / name).exists() for name in _RUN_FILES)
+    return parse_config(_read_yaml(path), overrides, where=str(config), local_plugins=not is_in_run_folder)
 
 
 def config_of_model(base: str, overrides: Iterable[str] = (), *, where: str = "overrides", **model: Any) -> Config:
@@ -81,7 +81,7 @@ def load_config_of_run(path: str | Path, overrides: Iterable[str] = ()) -> Confi
 
 
 def packaged_configs() -> dict[str, str]:
-    """Return the configs of the package: name -> first sentence of its comment."""
+    """Return the configs of the package: name -> first sentence of the comment at its top."""
     heads = {path.stem: path.read_text(encoding="utf-8").split("\n\n")[0] for path in _PACKAGED.glob("*.yaml")}
     return {name: re.sub(r"\n?# ?", " ", head).split(". ")[0].strip(" .:\n") for name, head in sorted(heads.items())}
 
@@ -133,7 +133,7 @@ def parse_config(
         plain = with_plugins(plain, where=where, local_plugins=local_plugins)
         return Config.model_validate_json(_as_json(with_complete_replay(plain), where))
     except ValidationError as error:
-        lines = _wrong_values(error)
+        lines = _describe_wrong_values(error)
     problem = "\n  ".join([f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong", *lines]) + "\n"
     raise InputError(where=where, found=problem, fix="`vjepa2-ac config schema` lists every key with its range")
 
@@ -197,7 +197,7 @@ _Dumper.add_implicit_resolver("!number", re.compile(r"^[-+]?[\d_]*\.?[\d_]*[eE][
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        text = read_small_file(path, _MOST_BYTES).decode()
+        text = read_small_file(path, _MAX_BYTES).decode()
     except FileNotFoundError:
         fix = "`vjepa2-ac init` writes one for your data; `vjepa2-ac config list` shows those of the package"
         raise InputError(where=str(path), found="no such file", needed="a config", fix=fix) from None
@@ -229,7 +229,7 @@ _RARELY_WRITTEN_KEYS = {"check_crc", "connections", "prefetch", "short_episodes"
 def _keep_drawn_splits(values: Mapping[str, Any]) -> None:
     """Set `data.splits` to hash in the config of an older run without this key, because all its splits were drawn.
 
-    The config of a run contains all keys of its version. It is recognised by keys that users rarely write.
+    The config of a run contains all keys of its version. It is recognised by removed keys that users rarely wrote.
     """
     replay = values.get("replay")
     for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):
@@ -259,7 +259,7 @@ _OLDER_GRIPPER_VALUES = {"closedness": {}, "openness": {"gripper_open": 1.0, "gr
 
 
 def _replace_keys_of_model(model: dict[str, Any]) -> None:
-    """Replace the key `random` of 0.1 (the sizes of a new predictor) by `base: random` and `sizes`."""
+    """Replace the key `random` of version 0.1 (the sizes of a new predictor) by `base: random` and `sizes`."""
     if (sizes := model.pop("random", None)) is not None:
         model.update(base=RANDOM, sizes=sizes)
 
@@ -306,7 +306,7 @@ def register_plugins(modules: list[str]) -> None:
 
 
 def with_plugins(values: Mapping[str, Any], *, where: str, local_plugins: bool) -> dict[str, Any]:
-    """Import the plug-ins of a config and its data format; return the values with all plug-ins, those of --plugin too.
+    """Import the plug-ins and the data format of a config; return the values with the plug-ins of --plugin added.
 
     Args:
         values: The plain values, not validated yet.
@@ -358,7 +358,7 @@ _accepted_formats = dict(DataConfig.kinds)
 _TYPE_OF_A_UNION = re.compile(r"int|float|str|bool|.*[\[(-].*")  # pydantic's names of types in error locations
 
 
-def _wrong_values(error: ValidationError) -> list[str]:
+def _describe_wrong_values(error: ValidationError) -> list[str]:
     """Return a line for every wrong value; a key that allows several types gets one line, not one per type."""
     lines_by_key: dict[str, list[str]] = {}
     for detail in error.errors(include_url=False):
@@ -411,9 +411,9 @@ def _explain(key: str, detail: Any) -> str:
         owners = [source for source, kind in DataConfig.kinds.items() if name in kind.model_fields]
         return f"only for source {' or '.join(owners)}, and this is source {detail['loc'][-2]}"
     prefix = section + dot
-    siblings = [known.removeprefix(prefix) for known in all_keys() if known.rpartition(".")[0] == section]
+    siblings = [other.removeprefix(prefix) for other in all_keys() if other.rpartition(".")[0] == section]
     close_siblings = difflib.get_close_matches(name, siblings, n=1)
-    same_name = [known for known in all_keys() if known.endswith(f".{name}")]
+    same_name = [other for other in all_keys() if other.endswith(f".{name}")]
     if suggestions := [*close_siblings, *same_name]:
         return f"unknown key; did you mean {suggestions[0]}?"
-    return f"unknown key; known here: {', '.join(siblings)}"
+    return f"unknown key; available: {', '.join(siblings)}"

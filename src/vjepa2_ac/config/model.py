@@ -10,16 +10,16 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from vjepa2_ac.config.section import Affects, PositiveInt, Section, Share
 from vjepa2_ac.storage import paths
 
-# Limits far above the released model (width 1408, depth 40, 1.3 billion weights). They protect from files with absurd
-# sizes.
+# Limits far above the released model (width 1408, depth 40, 1.3 billion weights), as protection from damaged and
+# malicious files.
 Width = Annotated[int, Field(ge=1, le=16_384)]
 Depth = Annotated[int, Field(ge=1, le=512)]
 Heads = Annotated[int, Field(ge=1, le=1_024)]
 Ratio = Annotated[float, Field(gt=0.0, le=64.0)]
 VectorWidth = Annotated[int, Field(ge=1, le=4_096)]
-_MOST_TOKENS = 65_536  # per frame
-_MOST_WEIGHTS = 10**10  # 40 GB in float32
-_MOST_TARGETS = 4_096
+_MAX_TOKENS_PER_FRAME = 65_536
+_MAX_WEIGHTS = 10**10  # 40 GB in float32
+_MAX_TARGETS = 4_096
 _STATE_DIM = 7  # position, rotation, gripper
 _DEFAULT_ALPHA = 32.0  # in all configs of the package, at any rank
 
@@ -132,7 +132,7 @@ class ModelSizes(Section):
                 (rest, f"{name}.width {part.width} is not a multiple of {name}.heads {part.heads}"),
                 (
                     head < 6 or head % 2,
-                    f"{name}: heads of width / heads = {head} do not fit 3D RoPE (even, at least 6)",
+                    f"{name}: width / heads is {head}, and 3D RoPE needs an even number of at least 6",
                 ),
                 (part.width * part.mlp_ratio < 1, f"{name}.mlp_ratio {part.mlp_ratio} makes the MLP narrower than 1"),
             )
@@ -144,10 +144,13 @@ class ModelSizes(Section):
         weights = sum(part.depth * part.width**2 * (4 + 2 * part.mlp_ratio) for part in parts)
         weights += 6 * self.patch_size**2 * self.encoder.width  # patch embedding of 3 colours and 2 frames
         return self.check_rules(
-            (tokens > _MOST_TOKENS, f"image_size: {tokens:,} tokens a frame, more than {_MOST_TOKENS:,}"),
             (
-                weights > _MOST_WEIGHTS,
-                f"encoder and predictor have {weights:.2g} weights, more than {_MOST_WEIGHTS:.0e}",
+                tokens > _MAX_TOKENS_PER_FRAME,
+                f"image_size: {tokens:,} tokens per frame, more than {_MAX_TOKENS_PER_FRAME:,}",
+            ),
+            (
+                weights > _MAX_WEIGHTS,
+                f"encoder and predictor have {weights:.2g} weights, more than {_MAX_WEIGHTS:.0e}",
             ),
         )
 
@@ -172,7 +175,7 @@ class SizesConfig(Section):
 
     @property
     def model_sizes(self) -> ModelSizes:
-        """All sizes, with the MLP widths of the published models and, until the data are known, the widths of poses."""
+        """All sizes, with the MLP ratios of the published models. States and actions have the widths of poses."""
         released = EncoderSizes()
         ratio = released.mlp_ratio if self.encoder.width == released.width else 4.0
         encoder = EncoderSizes(mlp_ratio=ratio, **self.encoder.model_dump())
@@ -196,8 +199,8 @@ class EncoderConfig(Section):
     `hf://owner/name@revision` for such a folder on the Hub, or the folder of a model of this project. A run can resume
     after the path was changed, because the fingerprint of the weights is compared."""
     key: EncoderKey | None = None
-    """Which encoder of a `.pt` is loaded; null: the first of these that it contains. The file of a trained predictor
-    records the key of its encoder."""
+    """Which encoder of a `.pt` is loaded; null: the first of these that the file contains. The file of a trained
+    predictor records the key of its encoder."""
     frame: FramePath = "tubelet"
     """How a frame is encoded. tubelet: as a video of two equal frames, as for all published predictors. image (only
     V-JEPA 2.1): as one image, with the patch embedding for images."""
@@ -263,15 +266,16 @@ class AdapterConfig(Section):
     """Whether the scale is rank-stabilised (rsLoRA, arXiv 2312.03732)."""
     dropout: Share = 0.0
     """Dropout before the adapter's first matrix, in training only. The released recipe and our measurements use none.
-    Dropout takes an eighth of a step on a GPU (predicted), and memory for a mask and a copy of each layer's input."""
-    targets: Annotated[tuple[str, ...], Field(max_length=_MOST_TARGETS)] = ("q", "k", "v", "o", "fc1", "fc2")
+    Dropout takes an eighth of the step time on a GPU (estimated), and memory for a mask and a copy of each layer's
+    input."""
+    targets: Annotated[tuple[str, ...], Field(max_length=_MAX_TARGETS)] = ("q", "k", "v", "o", "fc1", "fc2")
     """Linear layers of the predictor with an adapter, by the last part of their name: the defaults, predictor_embed,
     predictor_proj, action_encoder and state_encoder. Or sets: attention (q, k, v, o), mlp (fc1, fc2), all (every linear
     layer). Or single layers by their full name, such as blocks.0.attn.q."""
     modules_to_save: tuple[Literal["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"], ...] = ()
     """Layers before and after the blocks that are trained directly, without an adapter."""
     dora: bool = False
-    """Train the norm of each row of a weight separately from its direction (DoRA, arXiv 2402.09353)."""
+    """Whether the norm of each row of a weight is trained separately from its direction (DoRA, arXiv 2402.09353)."""
     peft: dict[str, Any] = {}
     """Further options of PEFT's LoraConfig, for example {rank_pattern: {fc1: 32}, init_lora_weights: gaussian}."""
 

@@ -41,12 +41,10 @@ class ReplayConfig(Section):
 
     def find_mismatches(self, first: DataConfig) -> list[str]:
         """Return why clips of both data sets cannot be in one micro-batch, according to the two configs."""
-        same = ("frames", "states", "actions", "join_actions", "pose_frame")
-        pairs = [(name, getattr(self.data, name), getattr(first, name)) for name in same]
         lines = [
-            f"replay.data.{name} {second} differs from data.{name} {value}"
-            for name, second, value in pairs
-            if second != value
+            f"replay.data.{name} {replayed} differs from data.{name} {value}"
+            for name in ("frames", "states", "actions", "join_actions", "pose_frame")
+            if (replayed := getattr(self.data, name)) != (value := getattr(first, name))
         ]
         if self.data.uses_cached_latents != first.uses_cached_latents:
             lines.append("only one of data and replay.data uses cached latents. Set the same value of cache in both")
@@ -104,7 +102,7 @@ class Config(Section):
     def _parts_fit(self) -> Config:
         training, adapter, model, best = self.training, self.adapter, self.model, self.checkpoint.keep_best
         predictor, steps, lora = model.sizes.predictor, training.rollout_steps, adapter.kind == "lora"
-        graph, fp32, compiled = training.cuda_graph, training.precision == "fp32", training.compile != "off" and lora
+        is_fp32, is_compiled = training.precision == "fp32", training.compile != "off" and lora
         # A CUDA graph would repeat the same dropout masks, and the same loss scale of fp16.
         draws_or_scales = training.precision == "fp16" or adapter.dropout > 0
         has_patience, is_ranked = training.patience is not None, self.validation.ranking_clips > 0
@@ -118,9 +116,12 @@ class Config(Section):
                 model.is_random and lora,
                 "model.base: random needs adapter.kind: none, because all weights must be trained",
             ),
-            (fp32 and model.dtype != "float32", "training.precision fp32 needs model.dtype float32"),
-            (compiled and adapter.dora, "training.compile: blocks does not support adapter.dora. Turn one of them off"),
-            (graph and draws_or_scales, "training.cuda_graph needs adapter.dropout 0, and bf16 or fp32"),
+            (is_fp32 and model.dtype != "float32", "training.precision fp32 needs model.dtype float32"),
+            (
+                is_compiled and adapter.dora,
+                "training.compile: blocks does not support adapter.dora. Turn one of them off",
+            ),
+            (training.cuda_graph and draws_or_scales, "training.cuda_graph needs adapter.dropout 0, and bf16 or fp32"),
             (best == "ranking" and not is_ranked, "checkpoint.keep_best ranking needs validation.ranking_clips"),
             (
                 best == "off" and has_patience,

@@ -39,7 +39,7 @@ class Affects(Flag):
 
     NOTHING = 0  # nothing but speed, paths and outputs
     LATENTS = auto()  # the content of a latent cache
-    MEASURED = auto()  # the metrics of a validation; its clips are compared separately
+    MEASURED = auto()  # the metrics of a validation; its clips are recorded separately
     RUN = auto()  # the result of training: a run cannot resume with another value
     PLAN = auto()  # the decisions of the planner
     CLIPS = LATENTS | MEASURED | RUN
@@ -86,8 +86,8 @@ def collect_effects(section: type[BaseModel]) -> Mapping[str, Affects]:
 def get_effect(key: str, section: type[BaseModel]) -> Affects:
     """Return what a key affects.
 
-    For a part of a value, such as data.fields.cameras.left, this is what the key affects. For a section the annotations
-    of its keys are combined. The keys of `replay.data` are the same as those of `data`, but affect the run only.
+    A part of a value, such as data.fields.cameras.left, affects the same as its key. For a section, the annotations of
+    its keys are combined. The keys of `replay.data` are the same as those of `data`, but affect the run only.
 
     Raises:
         KeyError: There is no such key.
@@ -129,12 +129,12 @@ def values_that_affect(effects: Affects, section: BaseModel) -> dict[str, Any]:
 def _iterate_effects(section: type[BaseModel], outer: Affects | None, prefix: str) -> Iterator[tuple[str, Affects]]:
     for name, info in section.model_fields.items():
         annotation = next((entry for entry in info.metadata if isinstance(entry, Affects)), None)
-        inner = [] if prefix + name == REPLAY_DATA else find_sections(info.annotation)
-        for kind in (kind for base in inner for kind in [*getattr(base, "kinds", {}).values()] or [base]):
-            candidates = (annotation, getattr(kind, "affects", None), outer)
+        sections = [] if prefix + name == REPLAY_DATA else find_sections(info.annotation)
+        for inner in (kind for base in sections for kind in [*getattr(base, "kinds", {}).values()] or [base]):
+            candidates = (annotation, getattr(inner, "affects", None), outer)
             effect = next((candidate for candidate in candidates if candidate is not None), None)
-            yield from _iterate_effects(kind, effect, f"{prefix}{name}.")
-        if not inner:
+            yield from _iterate_effects(inner, effect, f"{prefix}{name}.")
+        if not sections:
             effect = outer if annotation is None else annotation
             if effect is None:
                 raise TypeError(
@@ -189,11 +189,11 @@ class ComponentOf:
         """
         values = value.plain() if isinstance(value, Component) else value
         values = {"name": values} if isinstance(values, str) else values
-        form = values if isinstance(values, Mapping) else {}
-        name, options = form.get("name", self.default), form.get("options", {})
-        is_known = bool(form) and form.keys() <= {"name", "options"}
-        if not is_known or not isinstance(name, str) or not isinstance(options, Mapping):
-            raise ValueError(f"{_FORMS} is expected")
+        mapping = values if isinstance(values, Mapping) else {}
+        name, options = mapping.get("name", self.default), mapping.get("options", {})
+        has_valid_keys = bool(mapping) and mapping.keys() <= {"name", "options"}
+        if not has_valid_keys or not isinstance(name, str) or not isinstance(options, Mapping):
+            raise ValueError(f"Input should be {_FORMS}")
         return Component(name, self.registry.changed_options(self.registry.require_registered(name), options))
 
     def __get_pydantic_core_schema__(self, _source: Any, _handler: Any) -> core_schema.CoreSchema:

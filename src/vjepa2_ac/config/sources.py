@@ -105,7 +105,7 @@ class RawDroidData(DataConfig):
 
     @property
     def offered_cameras(self) -> tuple[str, ...]:
-        """The camera names by mounting position, the left exterior camera first. Serial numbers are allowed, too."""
+        """The camera names by mounting position, the left exterior camera first. Serial numbers are also allowed."""
         return RAW_CAMERAS
 
 

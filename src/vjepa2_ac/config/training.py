@@ -104,8 +104,8 @@ class ValidationConfig(Section):
     batch_size: Annotated[int, Field(ge=2)] = 4
     """Number of clips per batch."""
     ranking_clips: Annotated[int, Field(ge=0), Affects.MEASURED] = 32
-    """Number of these clips on which the action-ranking error is measured, which shows whether a model can plan (docs/
-    evaluation.md). Two motions of each clip are used, as large as planned ones, forwards and backwards. 0: none."""
+    """Number of these clips on which the action-ranking error is measured (docs/evaluation.md). In each clip, the
+    largest motion that a planner could choose in one step is used, forwards and backwards. 0: none."""
     ranking_samples: Annotated[PositiveInt, Affects.MEASURED] = 32
     """Number of alternative actions per motion, drawn twice: from a box of 7.5 cm to each side, and with the length of
     the true action in random directions."""
@@ -119,7 +119,7 @@ class CheckpointConfig(Section):
     """Checkpoints, and their copies on remote storage."""
 
     every: PositiveInt = 1_000
-    """Number of optimizer steps between checkpoints; one is also saved when the last one is 15 minutes old."""
+    """Number of optimizer steps between checkpoints. A checkpoint is also saved when the last one is 15 minutes old."""
     keep: PositiveInt = 5
     """Number of newest checkpoints that are kept."""
     keep_best: Annotated[Literal["ranking", "error", "off"], OFF, Affects.MEASURED] = "ranking"
@@ -130,10 +130,9 @@ class CheckpointConfig(Section):
     checkpoint, the default is the newest."""
     remote: PathOrUrl | None = None
     """Where the run is copied during training: gs://bucket/folder, another writable fsspec URL, or a folder. A start
-    with an empty run_dir resumes from the copy. `keep` and the best checkpoint apply to the copy, too. null: no
-    copy."""
+    with an empty run_dir resumes from the copy. `keep` and `keep_best` also apply to the copy. null: no copy."""
     remote_every_minutes: NonNegative = 30.0
-    """Minutes between uploads to remote; there is also one at the end and on preemption."""
+    """Minutes between uploads to `remote`. The run is also uploaded at the end and on preemption."""
     remote_wait_seconds: NonNegative = 120.0
     """How long a preempted run waits for the upload, in seconds; shorter than the notice period of the machine."""
 

@@ -72,7 +72,7 @@ class RunState:
     """Progress of a run. Data order, learning rate and random numbers are functions of the step."""
 
     step: Count  # completed optimizer steps
-    run_id: str = ""  # random name of the run, the same on every machine
+    run_id: str = ""  # random id of the run, the same on every machine
     clips_done: Count = 0  # position in the sequence of clips of the whole run
     clips_per_step: PositiveInt | None = None  # summed over all processes
     clips_per_process: PositiveInt | None = None  # per process, from the config: batch_size * accumulation
@@ -157,7 +157,7 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
         folder: The checkpoint folder of the run.
         state: The progress of the run.
         write_files: Writes weights and optimizer state into the folder that it receives.
-        keep: Number of newest checkpoints to keep; the one of `state.best_step` is kept, too.
+        keep: Number of newest checkpoints to keep; the checkpoint of `state.best_step` is also kept.
 
     Raises:
         InputError: The folder cannot be written (full disk, no permission), or another process has written a complete
@@ -238,14 +238,14 @@ def find_damage(checkpoint: Path) -> str | None:
 
 def read_state(checkpoint: Path) -> RunState:
     """Return the progress of the run at a checkpoint, without a best checkpoint if its folder is missing."""
-    state = read_written_state(checkpoint)
+    state = read_state_file(checkpoint)
     if state.best_name is None or (checkpoint.parent / state.best_name).is_dir():
         return state
     return replace(state, best_step=None, best_error=None, best_ranking_error=None, lowest_ranking_error=None)
 
 
-def read_written_state(checkpoint: Path) -> RunState:
-    """Return the progress of the run as it is in the file.
+def read_state_file(checkpoint: Path) -> RunState:
+    """Return the progress of the run from state.json, unchanged.
 
     Raises:
         InputError: The file is missing or damaged.
@@ -334,7 +334,7 @@ def read_torch(path: Path) -> Any:
     needed = "a file written by vjepa2-ac"
     with translate_read_errors(path, needed=needed):
         try:
-            _require_as_written(path)
+            _require_uncompressed_zip(path)
             return torch.load(path, weights_only=True, map_location="cpu")
         except Exception as error:  # torch raises errors of any type for a damaged file
             if is_os_read_error(error):
@@ -345,15 +345,15 @@ def read_torch(path: Path) -> Any:
             raise InputError(where=str(path), found=problem, needed=needed) from None
 
 
-def _require_as_written(path: Path) -> None:
+def _require_uncompressed_zip(path: Path) -> None:
     """Refuse all formats but uncompressed zip archives: a small file of another format can need unlimited memory.
 
     Raises:
         OSError: The file cannot be read.
-        ValueError: It is no zip archive, or its parts are compressed.
+        ValueError: The file is no zip archive, or its entries are compressed.
     """
     with zipfile.ZipFile(path) as archive:
-        if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
             raise ValueError("it is compressed")
 
 
@@ -395,14 +395,14 @@ def select_checkpoint(run: Path, selection: str = SELECTED) -> SelectedCheckpoin
             `checkpoint.keep_best`), or a number of optimizer steps.
 
     Raises:
-        InputError: There is no such checkpoint, or it is damaged; lists the existing ones.
+        InputError: There is no such checkpoint, or it is damaged; the message lists the complete checkpoints.
     """
     folder = run / CHECKPOINTS
     newest = newest_checkpoint(folder)
     if newest is None:
         fix = f"Resume training with `{shell_command('train', run, '--resume')}`"
         raise InputError(where=str(run), found="a run without a complete checkpoint", needed="at least one", fix=fix)
-    state = read_written_state(newest)
+    state = read_state_file(newest)
     if selection == NEWEST or (selection == SELECTED and state.best_step is None):
         reason = "the newest" if selection == NEWEST else _NOT_SELECTED
         return SelectedCheckpoint(newest, reason, selection, state)
@@ -411,7 +411,7 @@ def select_checkpoint(run: Path, selection: str = SELECTED) -> SelectedCheckpoin
     path = folder / checkpoint_name(step or 0)
     problem: str | None
     if step is None:
-        causes = "there was no validation, its settings were changed, checkpoint.keep_best was off, or it was deleted"
+        causes = "no validation, changed validation settings, checkpoint.keep_best=off, or a deleted checkpoint"
         problem = f"no best checkpoint ({causes})" if is_best else f"--checkpoint {selection}"
     elif not path.is_dir():
         problem = f"no checkpoint of step {step:,}"

@@ -4,7 +4,7 @@ RUN/config.yaml         the resolved config, including defaults and a calibrated
 RUN/environment.json    versions, machine, command and working directory of every start
 RUN/calibration.json    metrics of each stride, if data.stride was auto
 RUN/changes.json        99th percentile of the change of states per model step, for the value `data` in planning.limits
-RUN/run_id              the unique name of the run
+RUN/run_id              the unique id of the run
 RUN/metrics.jsonl       metrics, one JSON object per line
 RUN/metrics.json        metrics from `evaluate`, displayed in report.html and evaluation.png
 RUN/checkpoints/        step-XXXXXXXX folders
@@ -94,7 +94,7 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
             )
             fix = f"{options}. To resume with the changed config, add --allow-config-change"
             raise InputError(where=str(folder), found=problem, needed="the same config, to resume the run", fix=fix)
-    elif folder.exists() and not all(_is_without_config(path) for path in folder.iterdir()):
+    elif folder.exists() and not all(_may_precede_config(path) for path in folder.iterdir()):
         problem = "a folder with other files and without config.yaml"
         needed = "a new or empty folder, or the folder of a run"
         raise InputError(where=str(folder), found=problem, needed=needed, fix="Set another run_dir")
@@ -102,12 +102,12 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
         check_local_writable(folder)
 
 
-def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool = False) -> Path:
+def open_run_folder(config: Config, run_id: str, *, allow_config_change: bool = False) -> Path:
     """Create the run folder or prepare it for a resume, and record the config and the environment of this start.
 
     Args:
         config: The config of the run.
-        run_name: The name from `run_id`, or from a downloaded checkpoint.
+        run_id: The id from `read_or_create_run_id`, or from a downloaded checkpoint.
         allow_config_change: Resume with this config if the run in the folder has another one.
 
     Raises:
@@ -120,34 +120,34 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
         start["config_changes"] = changes
     path = folder / ENVIRONMENT
     write_atomically(path, json.dumps([*_earlier_starts(path), start], indent=1).encode())
-    write_atomically(folder / RUN_ID, run_name)
+    write_atomically(folder / RUN_ID, run_id)
     (folder / CHECKPOINTS).mkdir(exist_ok=True)
     remove_incomplete(folder / CHECKPOINTS)
     shutil.rmtree(folder / UPLOAD_LINKS, ignore_errors=True)  # links keep deleted checkpoints on the disk
     return folder
 
 
-def run_id(folder: Path) -> str:
-    """Return the name of the run in a folder, or a new random name.
+def read_or_create_run_id(folder: Path) -> str:
+    """Return the id of the run in a folder, or a new random id.
 
     Raises:
-        InputError: The file does not contain a valid name; trackers use it in paths.
+        InputError: The file does not contain a valid id; trackers use the id in paths.
     """
     path = folder / RUN_ID
     if not path.is_file():
         return secrets.token_hex(8)
-    name = read_small_file(path, _MAX_ID_BYTES).decode(errors="replace").strip()
-    if not _ID.fullmatch(name):
-        raise InputError(where=str(path), found=short_repr(name), needed="the name of a run: letters, digits and . _ -")
-    return name
+    text = read_small_file(path, _MAX_ID_BYTES).decode(errors="replace").strip()
+    if not _ID.fullmatch(text):
+        raise InputError(where=str(path), found=short_repr(text), needed="the id of a run: letters, digits and . _ -")
+    return text
 
 
 def write_config(config: Config) -> list[str]:
-    """Write the config into the run folder if it differs from the one there, and return the changes.
+    """Write the config into the run folder if it differs from the stored config, and return the changes.
 
     `train RUN --resume` reads this file, so that a changed setting also applies to the next start.
     """
-    path, changes = Path(config.run_dir, CONFIG), config_changes(config)
+    path, changes = Path(config.run_dir, CONFIG), list_config_changes(config)
     if changes or not path.exists():
         write_atomically(path, config_as_yaml(config).encode())
     return changes
@@ -159,7 +159,7 @@ def has_same_results(config: Config) -> bool:
     return not any(key in _PATHS or (Affects.RUN | Affects.MEASURED) & get_effect(key, Config) for key in changed)
 
 
-def config_changes(config: Config) -> list[str]:
+def list_config_changes(config: Config) -> list[str]:
     """Return a line `key: old -> new` for each value that differs from the config in the run folder."""
     folder = Path(config.run_dir)
     if not (folder / CONFIG).is_file():
@@ -183,7 +183,7 @@ def is_run(subject: str) -> bool:
 def read_run_config(folder: Path, overrides: Iterable[str] = ()) -> Config:
     """Return the config of a run.
 
-    Relative paths that do not exist from the working directory are resolved from where the run was started.
+    Relative paths that do not exist in the working directory are resolved from the folder in which the run was started.
 
     Args:
         folder: The run folder.
@@ -198,19 +198,19 @@ def read_run_config(folder: Path, overrides: Iterable[str] = ()) -> Config:
         raise InputError(where=str(folder), found=problem, needed=needed)
     overrides = [*overrides, f"run_dir={json.dumps(to_config_value(folder))}"]
     config = load_config_of_run(folder / CONFIG, overrides)
-    moved = [f"{key}={json.dumps(path)}" for key, path in _seen_from_start(config, folder)]
+    moved = [f"{key}={json.dumps(path)}" for key, path in _resolve_missing_paths(config, folder)]
     return load_config_of_run(folder / CONFIG, [*overrides, *moved]) if moved else config
 
 
-def _seen_from_start(config: Config, folder: Path) -> Iterator[tuple[str, str]]:
-    """Yield key and new path for relative paths that exist only from a folder in which the run was started."""
+def _resolve_missing_paths(config: Config, folder: Path) -> Iterator[tuple[str, str]]:
+    """Yield key and absolute path of relative paths that exist only from a folder in which the run was started."""
     flat = config_as_flat_dict(config)
     data_sets = zip(("data", "replay.data"), config.data_sets, strict=False)
-    only_names = {f"{name}.idle.ranges" for name, data in data_sets if data.is_cache}  # not read, only part of a key
+    unread = {f"{name}.idle.ranges" for name, data in data_sets if data.is_cache}  # only a part of the cache's key
     starts = [str(start.get("folder")) for start in reversed(_earlier_starts(folder / ENVIRONMENT))]
     for key in _PATHS:
         path = flat.get(key)
-        if path is None or path == RANDOM or key in only_names or is_url(path) or path.startswith(BUILTIN):
+        if path is None or path == RANDOM or key in unread or is_url(path) or path.startswith(BUILTIN):
             continue
         if Path(path).exists():
             continue
@@ -243,8 +243,8 @@ def environment() -> dict[str, object]:
     }
 
 
-def _is_without_config(path: Path) -> bool:
-    """Return whether a file may exist in a new run folder without config: from a killed start or another process."""
+def _may_precede_config(path: Path) -> bool:
+    """Return whether a file may exist in a folder before config.yaml: the lock, or a file of a killed start."""
     return path.name == LOCK or (path.name.startswith(f".{CONFIG}.") and path.name.endswith(".partial"))
 
 
@@ -266,12 +266,12 @@ def with_values_of_run(config: Config) -> Config:
     folder = Path(config.run_dir)
     if not (folder / CONFIG).is_file():
         return config
-    run = read_run_config(folder)
-    if config.data.stride == "auto" and run.data.stride != "auto":
-        config = config.with_stride(run.data.stride)
+    run_config = read_run_config(folder)
+    if config.data.stride == "auto" and run_config.data.stride != "auto":
+        config = config.with_stride(run_config.data.stride)
     data, *replay_data = [
         section if "splits" in section.model_fields_set else section.model_copy(update={"splits": before.splits})
-        for section, before in zip(config.data_sets, [*run.data_sets, run.data], strict=False)
+        for section, before in zip(config.data_sets, [*run_config.data_sets, run_config.data], strict=False)
     ]
     replay = config.replay and config.replay.model_copy(update={"data": replay_data[0]})
     return config.model_copy(update={"data": data, "replay": replay})

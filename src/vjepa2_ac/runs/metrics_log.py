@@ -62,25 +62,25 @@ class MetricsLog:
         with translate_write_errors(self.path):
             write_atomically(self.path, "".join(json.dumps(row) + "\n" for row in rows).encode())
             self._handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
-        self._waiting = b""  # rows that could not be written yet; the first may be partly written
+        self._unwritten = b""  # rows that could not be written yet; the first may be partly written
         self._trackers = trackers or Trackers({})
 
     def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Append a row: its kind (train, validation), its optimizer step, and metrics (numbers or lists of numbers)."""
         plain = {key: finite_or_none(value) if isinstance(value, float) else value for key, value in metrics.items()}
         row = {"kind": kind, "step": step, **plain}
-        self._waiting += (json.dumps(row) + "\n").encode()
+        self._unwritten += (json.dumps(row) + "\n").encode()
         self._write()
         self._trackers.log(kind, step, metrics)
 
-    def show(self, kind: str, name: str, step: int, image: Image) -> None:
+    def log_image(self, kind: str, name: str, step: int, image: Image) -> None:
         """Send an image to the trackers; metrics.jsonl does not contain images."""
         self._trackers.log_image(kind, name, step, image)
 
     @property
     def has_unwritten_rows(self) -> bool:
         """Whether some rows could not be written yet."""
-        return bool(self._waiting)
+        return bool(self._unwritten)
 
     @contextmanager
     def flush_before_checkpoint(self) -> Iterator[None]:
@@ -94,7 +94,7 @@ class MetricsLog:
         """
         error = self._write(sync=True)
         yield
-        if error and self._waiting:
+        if error and self._unwritten:
             error = self._write(sync=True)
         if error:  # after a failed fsync the system may have discarded the data
             problem = f"the latest metrics cannot be written ({error.strerror or error}), and are lost"
@@ -102,13 +102,13 @@ class MetricsLog:
             raise InputError(where=str(self.path), found=problem, fix=f"The checkpoint of this step is saved. {fix}")
 
     def _write(self, *, sync: bool = False) -> OSError | None:
-        """Write the waiting rows, and with `sync` flush them to the disk; return the error if this fails."""
-        if not self._waiting and not sync:
+        """Write the unwritten rows, and with `sync` flush them to the disk; return the error if this fails."""
+        if not self._unwritten and not sync:
             return None
         try:
             with warn_if_stalled(self.path):
-                while self._waiting:
-                    self._waiting = self._waiting[os.write(self._handle, self._waiting) :]
+                while self._unwritten:
+                    self._unwritten = self._unwritten[os.write(self._handle, self._unwritten) :]
                 if sync:
                     os.fsync(self._handle)
         except OSError as error:
@@ -169,7 +169,7 @@ def warn_if_stalled(path: Path) -> Iterator[None]:
 
 # ---- trackers ----
 
-Opening = Callable[[], Any]
+TrackerFactory = Callable[[], Any]
 """Creates a tracker (accelerate.tracking.GeneralTracker); its methods may raise any error."""
 
 
@@ -177,20 +177,20 @@ class Trackers:
     """The working trackers of a run.
 
     Args:
-        openings: Display name -> function that creates the tracker.
+        factories: Display name -> function that creates the tracker.
     """
 
-    def __init__(self, openings: Mapping[str, Opening]) -> None:
+    def __init__(self, factories: Mapping[str, TrackerFactory]) -> None:
         self._open: dict[str, Any] = {}
-        for name, opening in openings.items():
+        for name, factory in factories.items():
             with self._disable_on_error(name, "cannot be opened", "training continues without it"):
-                tracker = opening()
+                tracker = factory()
                 tracker.start()
                 self._open[name] = tracker
 
     def log(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Log the numbers of a row; each number of a list, such as errors by horizon, separately and counted from 1."""
-        numbers = {f"{kind}/{key}": value for key, value in _numbers(metrics).items()}
+        numbers = {f"{kind}/{key}": value for key, value in _flatten_numbers(metrics).items()}
         self._for_each(lambda tracker: tracker.log(numbers, step=step))
 
     def log_image(self, kind: str, name: str, step: int, image: Image) -> None:
@@ -236,16 +236,16 @@ def require_installed(tracking: TrackingConfig) -> None:
 
 
 def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int) -> Trackers:
-    """Open the trackers of a config; one that cannot be opened is disabled with a warning.
+    """Open the trackers of a config; a tracker that cannot be opened is disabled with a warning.
 
     Args:
         config: The config of the run.
         folder: The run folder, where TensorBoard and W&B write.
-        run_id: The permanent name of the run, also in the trackers.
+        run_id: The id of the run, also used by the trackers.
         first_step: Number of completed steps; TensorBoard drops later rows, because the run repeats these steps.
     """
     tracking = config.tracking
-    openings: dict[str, Opening] = {}
+    factories: dict[str, TrackerFactory] = {}
     if tracking.tensorboard and importlib.util.find_spec("tensorboard") is None:
         message = (
             "TensorBoard is not installed, so no event files are written. metrics.jsonl contains all metrics. To"
@@ -253,22 +253,22 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
         )
         logger.warning(message, pip_install("tensorboard"))
     elif tracking.tensorboard:
-        openings["TensorBoard"] = lambda: _tensorboard(folder, first_step)
+        factories["TensorBoard"] = lambda: _open_tensorboard(folder, first_step)
     if tracking.wandb != "disabled":
-        openings["Weights & Biases"] = lambda: _wandb(config, folder, run_id)
+        factories["Weights & Biases"] = lambda: _open_wandb(config, folder, run_id)
     if tracking.trackio:
-        openings["trackio"] = lambda: _trackio(config, run_id)
+        factories["trackio"] = lambda: _open_trackio(config, run_id)
     for name, options in tracking.others.items():
-        openings[name] = partial(TRACKERS.find(name), folder, run_id, **TRACKERS.options(name, options))
-    return Trackers(openings)
+        factories[name] = partial(TRACKERS.find(name), folder, run_id, **TRACKERS.options(name, options))
+    return Trackers(factories)
 
 
-def _project() -> str:
+def _project_name() -> str:
     """Return the project name for Weights & Biases and trackio."""
     return os.environ.get("WANDB_PROJECT", "vjepa2-ac")
 
 
-def _tensorboard(folder: Path, first_step: int) -> Any:
+def _open_tensorboard(folder: Path, first_step: int) -> Any:
     from accelerate.tracking import TensorBoardTracker
 
     tracker = TensorBoardTracker(TENSORBOARD, folder, purge_step=first_step + 1)
@@ -276,14 +276,14 @@ def _tensorboard(folder: Path, first_step: int) -> Any:
     return tracker
 
 
-def _wandb(config: Config, folder: Path, run_id: str) -> Any:
+def _open_wandb(config: Config, folder: Path, run_id: str) -> Any:
     """Return a W&B tracker. W&B ignores rows of steps it already has; a resumed run repeats exactly these rows."""
     import wandb
     from accelerate.tracking import WandBTracker
 
     # Console output is not captured, because it contains the progress bar. Timeouts limit the delay of training.
     return WandBTracker(
-        _project(),
+        _project_name(),
         id=run_id,
         name=folder.resolve().name,
         resume="allow",
@@ -295,7 +295,7 @@ def _wandb(config: Config, folder: Path, run_id: str) -> Any:
     )
 
 
-def _trackio(config: Config, run_id: str) -> Any:
+def _open_trackio(config: Config, run_id: str) -> Any:
     """Return a trackio tracker. trackio identifies a run by its name, which is therefore the run's id."""
     import trackio
     from accelerate.tracking import TrackioTracker
@@ -305,10 +305,10 @@ def _trackio(config: Config, run_id: str) -> Any:
             self.log({name: trackio.Image(images[0]) for name, images in values.items()}, step=step)
 
     plain = config_as_flat_dict(config)
-    return WithImages(_project(), name=run_id, resume="allow", config=plain, embed=False)
+    return WithImages(_project_name(), name=run_id, resume="allow", config=plain, embed=False)
 
 
-def _numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
+def _flatten_numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
     numbers: dict[str, float] = {}
     for key, value in metrics.items():
         values = {f"{key}/{n}": v for n, v in enumerate(value, start=1)} if isinstance(value, list) else {key: value}

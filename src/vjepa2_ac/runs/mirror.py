@@ -29,7 +29,7 @@ from vjepa2_ac.runs.checkpoint import (
     list_checkpoints,
     parse_manifest,
     parse_step,
-    read_written_state,
+    read_state_file,
 )
 from vjepa2_ac.runs.folder import ENVIRONMENT, SMALL_FILES, UPLOAD_LINKS, describe_last_start
 from vjepa2_ac.storage.retries import suppress_retry_warnings
@@ -87,7 +87,7 @@ class RemoteCheckpoints:
         """Return the id of the run to which all checkpoints in a listing belong; None if it is not known.
 
         Args:
-            listing: The result of `list_files`; incomplete checkpoints count, too.
+            listing: The result of `list_files`; incomplete checkpoints also count.
             run_id: The expected run; None for any run.
 
         Raises:
@@ -116,8 +116,10 @@ class RemoteCheckpoints:
             before_each: Called before each file; an exception ends the upload.
         """
         name, manifest = checkpoint.name, (checkpoint / MANIFEST).read_bytes()
-        claim = next((claim for claim in (MANIFEST, UPLOADING) if claim in files), None)
-        if files and (claim is None or storage.read_small_file(self._path(name, claim), MAX_BYTES) != manifest):
+        remote_name = next((file for file in (MANIFEST, UPLOADING) if file in files), None)
+        if files and (
+            remote_name is None or storage.read_small_file(self._path(name, remote_name), MAX_BYTES) != manifest
+        ):
             self.remove(name)  # a different checkpoint with the same name
             files = {}
         sizes = {path: (checkpoint / path).stat().st_size for path in parse_manifest(manifest)}
@@ -161,9 +163,8 @@ class RemoteCheckpoints:
 class Mirror:
     """A mirror that keeps a remote folder in sync with a run folder, in a thread, one upload pass at a time.
 
-    An outage causes one warning, however long it lasts. Files that exist only on this machine at the end cause another
-    one. As a context manager it stops uploading at the end; if the run ends with an error, it uploads existing files
-    first.
+    An outage causes one warning. Files that are only on this machine at the end cause another. As a context manager it
+    stops uploading at the end; if the run ends with an error, it first uploads the existing files.
 
     Args:
         location: The value of `checkpoint.remote`.
@@ -176,10 +177,10 @@ class Mirror:
         self._folder, self._config = Path(config.run_dir), config.checkpoint
         self._thread: threading.Thread | None = None
         self._started_s = -float("inf")
-        self._target: str | None = None  # the newest local checkpoint when the thread started
+        self._target: str | None = None  # the newest local checkpoint at the start of the current upload pass
         self._newest_uploaded: str | None = None  # the newest remote checkpoint
         self._uploaded_starts: bytes | None = None  # if the remote list of starts differs, a later start wrote it
-        self._outage_reported = self._is_lost = self._is_ending = self._has_ended = False
+        self._is_outage_reported = self._is_taken = self._is_ending = self._has_ended = False
         shutil.rmtree(self._folder / UPLOAD_LINKS, ignore_errors=True)  # links of a killed process
 
     def upload_if_due(self) -> None:
@@ -215,11 +216,11 @@ class Mirror:
                     limit_s = time.monotonic() - started_s + self._config.remote_wait_seconds
                 self._thread.join(_POLL_INTERVAL_S)
         in_time, self._has_ended = not self.is_uploading, True
-        if not self._is_lost and not (in_time and self._newest_uploaded == self._newest_local()):
+        if not self._is_taken and not (in_time and self._newest_uploaded == self._newest_local()):
             text = (
-                "%s contains checkpoints up to %s. Later ones in %s are only on this machine%s. The next start uploads"
+                "%s contains checkpoints up to %s. Later checkpoints in %s are only on this machine%s. The next start"
             )
-            text += " them"
+            text += " uploads them"
             newest = self._newest_uploaded or "those of earlier starts"
             reason = "" if in_time else ", because the time for uploads was over"
             logger.warning(text, self._remote.location, newest, self._folder / CHECKPOINTS, reason)
@@ -234,7 +235,7 @@ class Mirror:
 
     def _start_pass(self) -> None:
         self._started_s, self._target = time.monotonic(), self._newest_local()
-        if not self._is_lost:
+        if not self._is_taken:
             self._thread = threading.Thread(target=self._run_pass, name="mirror", daemon=True)
             self._thread.start()
 
@@ -242,17 +243,17 @@ class Mirror:
         try:
             with suppress_retry_warnings():
                 self._upload_pass()
-            self._outage_reported = False
+            self._is_outage_reported = False
         except _CancelledError:
             pass
         except RemoteFolderTakenError as error:
-            self._is_lost = True
+            self._is_taken = True
             logger.warning("%s", error)
         except (UserError, OSError) as error:
-            log = logger.info if self._outage_reported else logger.warning
+            log = logger.info if self._is_outage_reported else logger.warning
             text = "%s is not up to date: %s. Training continues; next attempt in %g minutes"
             log(text, REMOTE_KEY, describe_upload_error(error), self._config.remote_every_minutes)
-            self._outage_reported = True
+            self._is_outage_reported = True
         except Exception:  # no error here may stop the run
             logger.exception("%s: %s is not up to date; training continues", REMOTE_KEY, self._remote.location)
         finally:
@@ -287,7 +288,7 @@ class Mirror:
         newest = next(filter(None, map(self._link_files, names)), None)
         if newest is None:
             return
-        best = read_written_state(newest).best_name
+        best = read_state_file(newest).best_name
         for name in sorted(listing.keys() - {*list_complete(listing), newest.name, best}):
             if step_number(name) < step_number(newest.name):
                 self._cancel_if_outdated()

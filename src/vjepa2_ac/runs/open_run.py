@@ -22,7 +22,7 @@ from vjepa2_ac.runs.checkpoint import (
     find_damage,
     list_checkpoints,
     newest_checkpoint,
-    read_written_state,
+    read_state_file,
     remove_incomplete,
 )
 from vjepa2_ac.runs.folder import CONFIG, SMALL_FILES, RunLock, check_run_folder, open_run_folder, with_values_of_run
@@ -114,10 +114,10 @@ def open_remote(
 ) -> Config:
     """Test access to `checkpoint.remote` if it is set, download a newer checkpoint, and return the config to use.
 
-    The test writes a small remote file and removes it again. Downloaded are the newest checkpoint whose files all match
-    its manifest, the best checkpoint, and the small files of the run. Damaged checkpoints are reported and skipped, and
-    removed after a complete one was downloaded. A remote folder that cannot be reached causes a warning; it is an error
-    if this machine has no checkpoint and the remote folder is known to contain some.
+    The test writes a small remote file and removes it again. The download contains the newest undamaged checkpoint, the
+    best checkpoint, and the small files of the run. Damaged checkpoints are reported and skipped, and removed after the
+    download. A remote folder that cannot be reached causes a warning, or an error if this machine has no checkpoint and
+    the remote folder is known to contain some.
 
     Args:
         config: The config of the run.
@@ -144,7 +144,7 @@ def open_remote(
     state = None
     with suppress(InputError):  # all local checkpoints are damaged, but a remote one may be complete
         newest = newest_checkpoint(run_dir / CHECKPOINTS)
-        state = None if newest is None else read_written_state(newest)
+        state = None if newest is None else read_state_file(newest)
     remote, newer = RemoteCheckpoints(location), list[str]()
     owner: str | None = None
     try:
@@ -159,7 +159,7 @@ def open_remote(
             return config
         # An owner without a complete checkpoint means that a machine was killed during its first upload.
         target = config if into is None else config.model_copy(update={"run_dir": str(into)})
-        _require_this_config(target, location, allow_config_change=allow_config_change)
+        _require_same_config(target, location, allow_config_change=allow_config_change)
         if lock is not None:
             lock.take()
         is_fetched = _fetch_newest(remote, newer, Path(target.run_dir), reporter, removes_damaged=into is None)
@@ -167,7 +167,7 @@ def open_remote(
         fix = f"{error.fix.rstrip('.')}. Or set another checkpoint.remote, or remove it"
         raise InputError(where=REMOTE_KEY, found=f"{error.where}: {error.found}", fix=fix) from error
     except UnreachableError as error:
-        if state is None and (newer or owner is not None):  # a new run could not use the remote folder of another one
+        if state is None and (newer or owner is not None):  # a new run could not use the remote folder of another run
             raise
         local_state = f"step {state.step}" if state else "no checkpoint"
         newer_remote = f"; {newer[0]} is newer" if newer else ""
@@ -181,7 +181,7 @@ def open_remote(
     raise InputError(where=REMOTE_KEY, found=problem, fix=fix)
 
 
-def _require_this_config(config: Config, location: str, *, allow_config_change: bool) -> None:
+def _require_same_config(config: Config, location: str, *, allow_config_change: bool) -> None:
     """Refuse a remote run whose config differs, as for a local run folder."""
     with tempfile.TemporaryDirectory() as folder:
         with suppress(FileNotFoundError):
@@ -225,7 +225,7 @@ def _fetch(remote: RemoteCheckpoints, name: str, checkpoints: Path) -> bool:
         shutil.rmtree(fetched)
         logger.warning("%s: %s: %s; skipped", remote.location, name, problem)
         return False
-    best = read_written_state(fetched).best_name
+    best = read_state_file(fetched).best_name
     if best is not None and best != name and not (checkpoints / best).is_dir():
         _fetch(remote, best, checkpoints)
     shutil.rmtree(final, ignore_errors=True)  # a damaged local checkpoint

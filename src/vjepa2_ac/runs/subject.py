@@ -32,12 +32,12 @@ class Subject:
 
     name: str  # the run folder, or the name of the model
     config: Config
-    world_model: WorldModel  # from `load_for_planning` on its device, with merged adapter; from `load_subject` neither
+    world_model: WorldModel  # on the CPU; `load_for_planning` moves it to its device and merges the adapter
     checkpoint: Path | None = None  # the checkpoint folder; None for a model
     chosen: str = ""  # description of the checkpoint; "" for a model
     is_base: bool = False  # the checkpoint has the weights of the base model
     note: str = ""  # a sentence about a checkpoint of step 0; "" for a trained checkpoint
-    warnings: tuple[str, ...] = ()  # the note; for planning also why plans may exceed the motions in the training data
+    warnings: tuple[str, ...] = ()  # the note, and a warning if plans may exceed the motions in the training data
 
     def as_dict(self) -> dict[str, Any]:
         """Return the identity of the model as plain values: its name, and hashes of the weights."""

@@ -18,7 +18,14 @@ from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.registry import TRAINING_HOOKS
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, newest_checkpoint, read_state
-from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, config_changes, has_same_results, read_run_config, write_config
+from vjepa2_ac.runs.folder import (
+    CALIBRATION,
+    CHANGES,
+    has_same_results,
+    list_config_changes,
+    read_run_config,
+    write_config,
+)
 from vjepa2_ac.runs.metrics_log import MetricsLog, open_trackers, require_installed
 from vjepa2_ac.runs.open_run import OpenRun, open_run
 from vjepa2_ac.storage import write_atomically
@@ -97,7 +104,7 @@ class RunOutputs:
         """Print the config changes since the last start, and the learning rate if a change affects it."""
         if self._open_run is None:
             return
-        changes = config_changes(run.config)
+        changes = list_config_changes(run.config)
         for line in changes:
             self._reporter.note(f"Config change: {line}")
         before = read_run_config(run.folder) if changes else run.config

@@ -34,7 +34,7 @@ from vjepa2_ac.runs.checkpoint import (
     write_checkpoint,
     write_torch,
 )
-from vjepa2_ac.runs.folder import run_id
+from vjepa2_ac.runs.folder import read_or_create_run_id
 from vjepa2_ac.runs.metrics_log import warn_if_stalled
 from vjepa2_ac.training.optim import load_moments
 from vjepa2_ac.training.step import Run
@@ -107,7 +107,7 @@ def _restore_in_all_processes(run: Run, reporter: Reporter) -> RunState:
 def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any] | None]:
     checkpoint = newest_checkpoint(run.folder / CHECKPOINTS)
     if checkpoint is None:
-        return RunState(step=0, run_id=run_id(run.folder)), None
+        return RunState(step=0, run_id=read_or_create_run_id(run.folder)), None
     load_trained(run.world_model, checkpoint / ADAPTER, trainable=True)
     try:
         moments = read_torch(checkpoint / OPTIMIZER)
@@ -117,7 +117,7 @@ def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any]
         fix = "Undo the changes of the config, or delete this checkpoint to resume from an older one"
         raise InputError(where=str(checkpoint), found=f"not the state of this run ({error})", fix=fix) from None
     reporter.note(f"Resuming from {checkpoint} (step {state.step:,} of {run.config.training.steps:,}).")
-    return replace(state, run_id=state.run_id or run_id(run.folder)), moments
+    return replace(state, run_id=state.run_id or read_or_create_run_id(run.folder)), moments
 
 
 def validation_settings(config: Config, dataset: Dataset) -> Mapping[str, str]:

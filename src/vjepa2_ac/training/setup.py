@@ -36,7 +36,7 @@ from vjepa2_ac.model.world_model import (
 )
 from vjepa2_ac.registry import TRAINING_HOOKS
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
-from vjepa2_ac.runs.checkpoint import ADAPTER, CHECKPOINTS, RunState, newest_checkpoint, read_written_state
+from vjepa2_ac.runs.checkpoint import ADAPTER, CHECKPOINTS, RunState, newest_checkpoint, read_state_file
 from vjepa2_ac.runs.folder import CONFIG, read_run_config
 from vjepa2_ac.training.cost import batch_bytes
 from vjepa2_ac.training.cuda_graph import GraphedMicroStep
@@ -261,7 +261,7 @@ def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
     folder = Path(config.run_dir)
     if not (folder / CONFIG).is_file() or (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is None:
         return
-    keys, states = ("data.path", "replay.data.path"), read_written_state(checkpoint).data
+    keys, states = ("data.path", "replay.data.path"), read_state_file(checkpoint).data
     earlier_configs = read_run_config(folder).data_sets
     for key, dataset, old_config, new_config, state in zip(
         keys, datasets, earlier_configs, config.data_sets, states, strict=False

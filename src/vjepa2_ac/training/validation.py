@@ -70,7 +70,7 @@ def record(run: Run, validation: Validation, metrics_log: MetricsLog | None) -> 
             with run.accelerator.autocast():
                 image = run.image_strip.draw(run.world_model, run.accelerator.device, run.folder, run.state.step)
             if image is not None:
-                metrics_log.show("validation", "imagined", run.state.step, image)
+                metrics_log.log_image("validation", "imagined", run.state.step, image)
     criterion, before = run.config.checkpoint.keep_best, run.state
     if criterion != "off":
         run.state = before.with_validation(

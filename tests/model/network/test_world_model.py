@@ -92,7 +92,7 @@ def test_model_without_its_encoder_predicts_as_before_and_keeps_the_fingerprint(
     [
         ({"predictor": {"depth": 10**9}}, "sizes: predictor.depth: Input should be less than or equal to 512"),
         ({"encoder": {"width": 16_384, "depth": 512, "heads": 128}}, "weights, more than"),
-        ({"image_size": 8_192, "patch_size": 1}, "tokens a frame, more than 65,536"),
+        ({"image_size": 8_192, "patch_size": 1}, "tokens per frame, more than 65,536"),
         ({"encoder": {"mlp_ratio": 1e-9}}, "makes the MLP narrower than 1"),
         ({"encoder": {"mlp_ratio": "4"}}, "sizes: encoder.mlp_ratio: Input should be a valid number"),
         (None, "sizes: Input should be"),
