@@ -180,7 +180,7 @@ class Mirror:
         self._target: str | None = None  # the newest local checkpoint at the start of the current upload pass
         self._newest_uploaded: str | None = None  # the newest remote checkpoint
         self._uploaded_starts: bytes | None = None  # if the remote list of starts differs, a later start wrote it
-        self._is_outage_reported = self._is_taken = self._is_ending = self._has_ended = False
+        self._is_outage_reported = self._has_other_owner = self._is_ending = self._has_ended = False
         shutil.rmtree(self._folder / UPLOAD_LINKS, ignore_errors=True)  # links of a killed process
 
     def upload_if_due(self) -> None:
@@ -216,7 +216,7 @@ class Mirror:
                     limit_s = time.monotonic() - started_s + self._config.remote_wait_seconds
                 self._thread.join(_POLL_INTERVAL_S)
         in_time, self._has_ended = not self.is_uploading, True
-        if not self._is_taken and not (in_time and self._newest_uploaded == self._newest_local()):
+        if not self._has_other_owner and not (in_time and self._newest_uploaded == self._newest_local()):
             text = (
                 "%s contains checkpoints up to %s. Later checkpoints in %s are only on this machine%s. The next start"
             )
@@ -235,7 +235,7 @@ class Mirror:
 
     def _start_pass(self) -> None:
         self._started_s, self._target = time.monotonic(), self._newest_local()
-        if not self._is_taken:
+        if not self._has_other_owner:
             self._thread = threading.Thread(target=self._run_pass, name="mirror", daemon=True)
             self._thread.start()
 
@@ -247,7 +247,7 @@ class Mirror:
         except _CancelledError:
             pass
         except RemoteFolderTakenError as error:
-            self._is_taken = True
+            self._has_other_owner = True
             logger.warning("%s", error)
         except (UserError, OSError) as error:
             log = logger.info if self._is_outage_reported else logger.warning
