@@ -2,14 +2,14 @@
 
     python benchmarks/action_score.py checkpoints/vjepa2-ac-vitg.pt franka.yaml --clips 64
 
-From a frame of each clip the model plans towards the frame that came three steps later. The error is the distance of
-the plan's end from the demonstrated end, summed over x, y and z; the score is max(0, 800 (0.1 - error in metres)).
-Compare with the zero action: a model that ignores its actions does worse.
+In each clip, the model plans from one frame towards the frame three steps later. The error is the absolute difference
+between the total displacement of the plan and of the demonstration, summed over x, y and z. The score is
+max(0, 800 (0.1 - error in metres)). It is compared with the score of the zero action.
 
 Source: facebookresearch/jepa-wms @ 6eafb14, configs/evals/simu_env_planning/droid/vj2ac,
 evals/simu_env_planning/planning (planner.py: CEMPlanner; objectives.py: ReprTargetDistMPCObjective; plan_evaluator.py:
 PlanEvaluator.eval, end_distance_xyz), app/vjepa_wm/modelcustom/simu_env_planning/vit_enc_preds.py: EncPredWM.unroll,
-app/plan_common/plot/logs_plan_joint_per_design_choice.py. What differs: docs/published_figures.md.
+app/plan_common/plot/logs_plan_joint_per_design_choice.py. Differences: docs/published_figures.md.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.spaces import integrate_changes
 
 STEPS = 3
-AT_ONCE = 64  # samples
-FRAMES_SEEN = 2  # by the model at most, predicted ones included
+BATCH_SIZE = 64  # samples per call of the predictor
+CONTEXT_FRAMES = 2  # maximum number of input frames of a prediction, true or predicted
 PROTOCOL = PlanningConfig(
     planner=Component(
         "cem",
@@ -66,20 +66,21 @@ def energies(
     goal: Float[Tensor, "tokens dim"],
     actions: Float[Tensor, "samples steps 7"],
 ) -> Float[Tensor, " samples"]:
-    """Return the mean squared difference of the last predicted frame to the goal; the model sees at most two."""
-    if len(actions) > AT_ONCE:
-        return torch.cat([energies(model, frame, state, goal, part) for part in actions.split(AT_ONCE)])  # type: ignore[no-untyped-call]  # torch
+    """Return the mean squared difference of the last predicted frame from the goal."""
+    if len(actions) > BATCH_SIZE:
+        return torch.cat([energies(model, frame, state, goal, part) for part in actions.split(BATCH_SIZE)])  # type: ignore[no-untyped-call]  # torch
     actions = actions.to(state)
     states = integrate_changes(state, actions)[:, :-1]
-    first = slice(0, FRAMES_SEEN)
+    first = slice(0, CONTEXT_FRAMES)
     frames = model.rollout(frame.expand(len(actions), 1, *frame.shape), actions[:, first], states[:, first])
-    for end in range(FRAMES_SEEN + 1, STEPS + 1):
-        seen = slice(end - FRAMES_SEEN, end)
-        frames = torch.cat([frames[:, 1:], model.predict(frames, actions[:, seen], states[:, seen])[:, -1:]], dim=1)
+    for end in range(CONTEXT_FRAMES + 1, STEPS + 1):
+        context = slice(end - CONTEXT_FRAMES, end)
+        predicted = model.predict(frames, actions[:, context], states[:, context])[:, -1:]
+        frames = torch.cat([frames[:, 1:], predicted], dim=1)
     return squared_difference(frames[:, -1].float(), goal.float()).mean(dim=(1, 2)).cpu()
 
 
-def main(words: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure a run or a model and print the scores."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("subject", help="folder of a run, or a value of model.base")
@@ -92,7 +93,7 @@ def main(words: Sequence[str] | None = None) -> None:
         default=PROTOCOL.samples,
         help="samples per iteration (default: %(default)s, as published)",
     )
-    options = parser.parse_args(words)
+    options = parser.parse_args(arguments)
     config = load_config(options.config, options.overrides)
     model = load_subject(options.subject, config=None if is_run(options.subject) else config).world_model
     if model.adaptation is not None:
@@ -109,27 +110,27 @@ def main(words: Sequence[str] | None = None) -> None:
             batch = encode_batch(model, pixels, device=device)
             for row in range(len(batch.starts)):
                 generator = make_transition(batch, row, 0).make_generator(config.seed)
-                place = int(generator.integers(batch.latents.shape[1] - STEPS))
-                ends = batch.actions[row, place : place + STEPS, :3].sum(dim=0).cpu()
+                start = int(generator.integers(batch.latents.shape[1] - STEPS))
+                demonstrated = batch.actions[row, start : start + STEPS, :3].sum(dim=0).cpu()
                 cost = partial(
                     energies,
                     model,
-                    batch.latents[row, place],
-                    batch.states[row, place],
-                    batch.latents[row, place + STEPS],
+                    batch.latents[row, start],
+                    batch.states[row, start],
+                    batch.latents[row, start + STEPS],
                 )
                 plan = planner.plan(cost, torch.Generator().manual_seed(int(generator.integers(2**62))))
                 planned = plan.actions[:, :3].sum(dim=0)
-                errors.append([float((planned - ends).abs().sum()), float(ends.abs().sum())])
+                errors.append([float((planned - demonstrated).abs().sum()), float(demonstrated.abs().sum())])
                 ids.append(batch.episode_ids[row])
     columns = np.stack([np.array(errors), np.ones((len(errors), 2))])
-    for what, score in zip(("plans", "zero action"), bootstrap(_score, columns, ids), strict=True):
-        print(f"{what}: Action Score {score:.1f} (best 80; 95 % interval over episodes)")
+    for policy, score in zip(("plans", "zero action"), bootstrap(_compute_scores, columns, ids), strict=True):
+        print(f"{policy}: Action Score {score:.1f} (best 80; 95 % interval over episodes)")
     plans_cm, zero_cm = 100 * columns[0].mean(axis=0)
-    print(f"mean distance of the end from the demonstration: plans {plans_cm:.1f} cm, zero action {zero_cm:.1f} cm")
+    print(f"mean error of the displacement: plans {plans_cm:.1f} cm, zero action {zero_cm:.1f} cm")
 
 
-def _score(sums: np.ndarray) -> np.ndarray:
+def _compute_scores(sums: np.ndarray) -> np.ndarray:
     return np.asarray(np.maximum(0.0, 800 * (0.1 - sums[0] / sums[1])))
 
 

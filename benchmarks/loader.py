@@ -1,13 +1,13 @@
-"""How fast and lean are clips: RLDS against TFDS, two workers, an index of DROID's size, MP4s against naive decoding?
+"""Measure the speed and memory of the loader: RLDS clips compared with TFDS, loader workers, an index of DROID's size.
 
     python benchmarks/loader.py [--path FOLDER] [--tfds-python /path/to/an/environment/bin/python]
 
-One process, 16-frame clips of one camera, at random places of random episodes, as in training. Ours: the first clip of
-each episode on this machine, which checks the CRC of the record, and all later ones. The baselines, in the same run on
-the same records: decoding every frame of every camera; and TFDS in an interpreter that has tensorflow_datasets, with
-one thread as ours, nothing shuffled and nothing interleaved, with all pictures decoded and with SkipDecoding and 16
-frames decoded afterwards. TFDS reads in file order only: a clip costs it an episode. Its steps are taken from
-the episode in two ways (`batch` it and slice; `skip` and `take`), and the faster one counts.
+One process reads clips of 16 frames of one camera, at random steps of random episodes, as in training. This package is
+measured twice: the first read of a record, which checks its CRC, and all later reads. The baselines read the same
+records: decoding of every frame of every camera; and TFDS with one thread, without shuffling and interleaving, once
+with all images decoded, and once with SkipDecoding and 16 frames decoded afterwards. TFDS needs an interpreter that has
+tensorflow_datasets. TFDS can only read in file order, so it reads a whole episode for each clip. The steps are selected
+by `batch` and a slice, or by `skip` and `take`; the shorter time is reported.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ import random, sys, time
 import tensorflow as tf, tensorflow_datasets as tfds
 folder, skip = sys.argv[1], sys.argv[5] == "skip"
 clips, frames, stride = map(int, sys.argv[2:5])
-steps_of_all = int(sys.argv[6])
+num_steps = int(sys.argv[6])
 span = (frames - 1) * stride + 1
 tf.config.threading.set_intra_op_parallelism_threads(1)
 tf.config.threading.set_inter_op_parallelism_threads(1)
@@ -60,27 +60,27 @@ dataset = builder.as_dataset(split="train", decoders=decoders, read_config=confi
 options = tf.data.Options()
 options.threading.private_threadpool_size = 1
 episodes = iter(dataset.repeat().with_options(options))
-def clip(way):
-    first = random.randrange(steps_of_all - span + 1)
+def clip(variant):
+    first = random.randrange(num_steps - span + 1)
     steps = next(episodes)["steps"]
-    steps = steps.batch(steps_of_all) if way == "batch" else steps.skip(first).take(span).batch(span)
+    steps = steps.batch(num_steps) if variant == "batch" else steps.skip(first).take(span).batch(span)
     for batch in steps:
-        pictures = batch["observation"][cameras[0]]
-        pictures = (pictures[first : first + span] if way == "batch" else pictures)[::stride]
-        return tf.stack([tf.io.decode_jpeg(one) for one in pictures]).numpy() if skip else pictures.numpy()
+        images = batch["observation"][cameras[0]]
+        images = (images[first : first + span] if variant == "batch" else images)[::stride]
+        return tf.stack([tf.io.decode_jpeg(image) for image in images]).numpy() if skip else images.numpy()
 seconds = []
-for way in ("batch", "take"):
-    clip(way)
+for variant in ("batch", "take"):
+    clip(variant)
     start = time.perf_counter()
     for _ in range(clips):
-        assert clip(way).shape[0] == frames
+        assert clip(variant).shape[0] == frames
     seconds.append((time.perf_counter() - start) / clips)
 print(min(seconds))
 """
 
 
 def main(options: Sequence[str] | None = None) -> None:
-    """Measure and print."""
+    """Measure and print all results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--path", help="a data set in DROID's RLDS schema; default: a synthetic data set")
     parser.add_argument("--clips", type=int, default=48, help="clips per measurement (default: %(default)s)")
@@ -100,7 +100,7 @@ def main(options: Sequence[str] | None = None) -> None:
 
 
 def measure_clips(config: RldsData, clips: int, tfds_python: str | None) -> None:
-    """Time every way of reading the same number of clips, and print clips per second and ratios."""
+    """Time each method of reading the same number of clips, and print clips per second and ratios."""
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
     from tfrecords import decode_example, index_set, read_record
 
@@ -108,43 +108,42 @@ def measure_clips(config: RldsData, clips: int, tfds_python: str | None) -> None
     start = time.perf_counter()
     dataset = open_dataset(config)
     order = ClipOrder(dataset.windows("train"), seed=0)
-    taken = time.perf_counter() - start
-    print(f"{config.path}: {len(dataset.table)} episodes, {len(order.windows)} clips, indexed in {taken:.3f} s")
+    seconds = time.perf_counter() - start
+    print(f"{config.path}: {len(dataset.table)} episodes, {len(order.windows)} clips, indexed in {seconds:.3f} s")
     print(f"{config.frames} frames at stride {config.stride}, {clips} random clips, medians (TFDS: mean):\n")
 
-    def later_reads(position: int) -> None:
+    def read_again(position: int) -> None:
         read_clip(dataset, ClipRequest(*order.window(position)))
 
-    def everything(position: int) -> None:
+    def decode_all(position: int) -> None:
         episode, first = order.window(position)
         features = decode_example(read_record(spans[episode]))
         for name in config.fields.cameras.values():
-            frames = np.stack([simplejpeg.decode_jpeg(picture, fastdct=True) for picture in features[name][1]])
+            frames = np.stack([simplejpeg.decode_jpeg(image, fastdct=True) for image in features[name][1]])
             frames[first : first + config.clip_steps : config.model_stride].copy()
 
     for episode in range(len(spans)):
         read_clip(dataset, ClipRequest(episode, 0))
     names = ("every frame of every camera", "ours, first read of a record", "ours")
 
-    def first_reads(position: int) -> None:
+    def read_first(position: int) -> None:
         with patch.object(rlds_source, "_is_checked", return_value=False):  # no record was checked before
-            later_reads(position)
+            read_again(position)
 
-    ways = (everything, first_reads, later_reads)
-    seconds = dict(zip(names, alternate(clips, *ways), strict=True))
+    clip_seconds = dict(zip(names, time_alternately(clips, decode_all, read_first, read_again), strict=True))
     if tfds_python:
         steps = int(dataset.table.num_steps.min())
-        seconds |= {
+        clip_seconds |= {
             "TFDS, full decode": run_tfds(tfds_python, config, clips, "full", steps),
             "TFDS, SkipDecoding, then 16 frames": run_tfds(tfds_python, config, clips, "skip", steps),
         }
-    print(f"{'':38}{'ms a clip':>12}{'clips/s':>10}{'ours is':>12}")
-    for name, each in seconds.items():
-        print(f"{name:38}{each * 1e3:12.1f}{1 / each:10.1f}{each / seconds['ours']:11.1f}x")
+    print(f"{'':38}{'ms per clip':>12}{'clips/s':>10}{'time / ours':>12}")
+    for name, seconds in clip_seconds.items():
+        print(f"{name:38}{seconds * 1e3:12.1f}{1 / seconds:10.1f}{seconds / clip_seconds['ours']:11.1f}x")
 
 
 def measure_workers(config: DataConfig, batch_size: int = 4, batches: int = 60) -> None:
-    """Print clips per second of one worker and of two, and the memory of one."""
+    """Print clips per second with one and with two workers, and the memory of a worker."""
     speeds: dict[int, list[float]] = {1: [], 2: []}
     largest = 0.0
     for workers in (1, 2, 1, 2):
@@ -159,16 +158,16 @@ def measure_workers(config: DataConfig, batch_size: int = 4, batches: int = 60) 
         children = psutil.Process().children(recursive=True)
         largest = max([largest, *(child.memory_info().rss / 1e6 for child in children)])
         del loader
-    one, two = (max(speeds[workers]) for workers in (1, 2))
+    speed_1, speed_2 = (max(speeds[workers]) for workers in (1, 2))
     print(
-        f"\ntraining_loader, batches of {batch_size}, the better of two runs: 1 worker {one:.0f} clips/s, 2 workers",
-        end="",
+        f"\ntraining_loader, batches of {batch_size}, the better of two runs: 1 worker {speed_1:.0f} clips/s,", end=""
     )
-    print(f" {two:.0f} clips/s ({two / one:.2f}x); resident memory of a worker {largest:.0f} MB")
+    print(f" 2 workers {speed_2:.0f} clips/s ({speed_2 / speed_1:.2f}x);", end="")
+    print(f" resident memory of a worker {largest:.0f} MB")
 
 
 def measure_index(config: DataConfig) -> None:
-    """Print what index and order of as many episodes as DROID has cost, opened from the cache."""
+    """Print the time and memory to open an index of DROID's size from the cache, and to order its clips."""
     generator = np.random.default_rng(0)
     steps = generator.integers(61, 520, DROID_EPISODES)
     infos = [
@@ -182,45 +181,54 @@ def measure_index(config: DataConfig) -> None:
     table = replace(EpisodeTable.from_infos(infos), locators=locators)
     get_or_build_index(config.disk_cache, "synthetic", config.path, lambda: table)
     del infos, table
-    with multiprocessing.get_context("spawn").Pool(1) as fresh:  # memory freed by this process would be used again
-        clips, opened, taken, memory = fresh.apply(_open_index, (config,))
+    # In a new process, because memory that this process has freed would be reused.
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        clips, open_s, total_s, memory_mb = pool.apply(_open_index, (config,))
     size = (Path(str(config.disk_cache.dir)) / "index" / "synthetic.index").stat().st_size / 1e6
-    print(f"\nindex of {DROID_EPISODES:,} episodes, {size:.1f} MB: opened in {opened:.2f} s;", end="")
-    print(f" with the order of {clips:,} clips {taken:.2f} s, {memory:.0f} MB")
+    print(f"\nindex of {DROID_EPISODES:,} episodes, {size:.1f} MB: opened in {open_s:.2f} s;", end="")
+    print(f" with the order of {clips:,} clips {total_s:.2f} s, {memory_mb:.0f} MB")
 
 
 def _open_index(config: DataConfig) -> tuple[int, float, float, float]:
+    """Return the number of clips, the seconds to open the index and with the order, and the memory in MB."""
     process = psutil.Process()
     before, start = process.memory_info().rss, time.perf_counter()
-    table = get_or_build_index(config.disk_cache, "synthetic", config.path, _never)
-    opened = time.perf_counter() - start
-    everyone = np.ones(len(table), bool)
-    kept = StepSelection.all_steps(table, everyone)
-    order = ClipOrder(
-        select_split_windows(table, everyone, find_clip_windows(table, kept, config), config, "train"), seed=0
-    )
+    table = get_or_build_index(config.disk_cache, "synthetic", config.path, _refuse_to_build)
+    open_s = time.perf_counter() - start
+    all_episodes = np.ones(len(table), bool)
+    all_steps = StepSelection.all_steps(table, all_episodes)
+    windows = find_clip_windows(table, all_steps, config)
+    order = ClipOrder(select_split_windows(table, all_episodes, windows, config, "train"), seed=0)
     order.window(123_456)
-    taken, memory = time.perf_counter() - start, (process.memory_info().rss - before) / 1e6
-    return len(order.windows), opened, taken, memory
+    total_s, memory_mb = time.perf_counter() - start, (process.memory_info().rss - before) / 1e6
+    return len(order.windows), open_s, total_s, memory_mb
 
 
-def _never() -> EpisodeTable:
-    raise AssertionError("the index was not kept")
+def _refuse_to_build() -> EpisodeTable:
+    raise AssertionError("the index is not in the cache")
 
 
-def alternate(count: int, *ways: Callable[[int], None]) -> list[float]:
-    """Return the median seconds of each way; they take turns, so that a busy machine is busy for all of them."""
-    seconds: list[list[float]] = [[] for _ in ways]
+def time_alternately(count: int, *methods: Callable[[int], None]) -> list[float]:
+    """Return the median seconds of each method. The methods take turns, so that load slows all of them equally."""
+    seconds: list[list[float]] = [[] for _ in methods]
     for position in range(count):
-        for way, taken in zip(ways, seconds, strict=True):
+        for method, method_seconds in zip(methods, seconds, strict=True):
             start = time.perf_counter()
-            way(position)
-            taken.append(time.perf_counter() - start)
-    return [statistics.median(taken) for taken in seconds]
+            method(position)
+            method_seconds.append(time.perf_counter() - start)
+    return [statistics.median(method_seconds) for method_seconds in seconds]
 
 
 def run_tfds(python: str, config: DataConfig, clips: int, mode: str, steps: int) -> float:
-    """Return the mean seconds per clip that TFDS needs, in the given interpreter."""
+    """Return the mean seconds per clip of TFDS in another Python interpreter.
+
+    Args:
+        python: The interpreter.
+        config: The data set.
+        clips: Number of clips.
+        mode: "full", or "skip" for SkipDecoding.
+        steps: Number of steps of the shortest episode.
+    """
     command = [
         python,
         "-c",

@@ -1,17 +1,18 @@
 """Run all benchmarks that need a GPU: training step, memory, planning, encoders.
 
-    python benchmarks/on_gpu.py --official ../vjepa2           # all of it: 10 to 15 minutes on an H100
+    python benchmarks/on_gpu.py --official ../vjepa2           # all parts: 10 to 15 minutes on an H100
     python benchmarks/on_gpu.py --only graph official --out FOLDER
 
-Each part is a benchmark of this folder with the arguments below, in a process of its own that ends within its limit,
-and is imported while the part before it runs. What a part prints is in OUT/PART.log, its figures in OUT/PART.json,
-written after every row: whatever ends it leaves what was there. Parts that failed are named, and the exit status is 1
-then. Weights are random: times and memory do not depend on them. --official is a checkout of facebookresearch/vjepa2,
-whose step and planner are timed beside ours; without one they are left out.
+Each part is a benchmark of this folder with the arguments below. It runs in its own process with a time limit; the
+process imports its libraries while the previous part runs. The output of a part is in OUT/PART.log, its metrics are in
+OUT/PART.json, which is written after every row, so that interrupted parts keep their rows. If parts fail, their names
+are printed and the exit status is 1. Weights are random, because times and memory do not depend on them. --official is
+a checkout of facebookresearch/vjepa2, whose training step and planner are timed for comparison; without a checkout they
+are skipped.
 
-The command is made for a machine that is lent for minutes: PyTorch with CUDA, Triton and gcc are needed, what was
-compiled is read again from TORCHINDUCTOR_CACHE_DIR. benchmarks/results/gpu.txt has what an H100 printed at commit
-0d046757, whose command had four more parts (serving, decoder, numerics, latents).
+PyTorch with CUDA, Triton and gcc are needed. Compiled code is cached in TORCHINDUCTOR_CACHE_DIR.
+benchmarks/results/gpu.txt is the output on an H100 at commit 0d046757, where the command had four more parts (serving,
+decoder, numerics, latents).
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from timing import BESIDE
+from timing import DEFAULT_CHECKOUT
 
 _STEP = "--device cuda --frames 16 --repeats 3 --warm-up 1 --official"
 _PLAN = "--device cuda --horizon 1 --at-once 64 --no-memory --warm-up 1 --official"
-_QUICK = {"--device cuda": "--quick", "+graph": ""}  # instead, by --quick
+_QUICK = {"--device cuda": "--quick", "+graph": ""}  # replacements in the arguments with --quick
 _CPU_SCALE = 10  # of time limits with --quick: a CPU without AVX-512 emulates bfloat16
 
 
@@ -70,37 +71,38 @@ PARTS = (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the parts that are asked for."""
+    """Run the requested parts."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
     options = parse(arguments)
     if options.part:
         run(next(part for part in PARTS if part.name == options.part), options)
         return
     options.out.mkdir(parents=True, exist_ok=True)
-    parts = [part for part in PARTS if part.name in (options.only or [one.name for one in PARTS])]
-    given, failed = list(sys.argv[1:] if arguments is None else arguments), []
+    parts = [part for part in PARTS if options.only is None or part.name in options.only]
+    failed: list[str] = []
     scale = _CPU_SCALE if options.quick else 1
-    processes: list[subprocess.Popen[bytes]] = [started(parts[0], given, options.out)]
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))
+    processes: list[subprocess.Popen[bytes]] = [start(parts[0], arguments, options.out)]
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped by SIGTERM"))
     try:
         for number, part in enumerate(parts):
             began = time.monotonic()
             if number + 1 < len(parts):
-                processes.append(started(parts[number + 1], given, options.out))
+                processes.append(start(parts[number + 1], arguments, options.out))
             with suppress(subprocess.TimeoutExpired):
                 processes[number].communicate(b"go\n", timeout=part.limit_s * scale)
-            code = end(processes[number])
-            print(f"== {part.name}: exit {code}, {time.monotonic() - began:.0f} s", flush=True)
+            status = stop(processes[number])
+            print(f"== {part.name}: exit {status}, {time.monotonic() - began:.0f} s", flush=True)
             print((options.out / f"{part.name}.log").read_text(), flush=True)
-            failed += [part.name] if code else []
+            failed += [part.name] if status else []
     finally:
         for process in processes:
-            end(process)
+            stop(process)
     if failed:
         sys.exit(f"failed or out of time: {', '.join(failed)}")
 
 
-def end(process: subprocess.Popen[bytes]) -> int:
-    """End a process and all that it has started, if it has not ended; return its exit status."""
+def stop(process: subprocess.Popen[bytes]) -> int:
+    """Kill a process and its children, if it is still running; return its exit status."""
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGKILL)
     with suppress(BrokenPipeError):
@@ -109,32 +111,32 @@ def end(process: subprocess.Popen[bytes]) -> int:
     return process.wait()
 
 
-def started(part: Part, given: Sequence[str], out: Path) -> subprocess.Popen[bytes]:
-    """Start the process of a part: it imports what it needs, and waits for its turn on the device."""
+def start(part: Part, arguments: Sequence[str], out: Path) -> subprocess.Popen[bytes]:
+    """Start the process of a part. It imports its libraries, and waits for a line on its standard input."""
     with (out / f"{part.name}.log").open("wb") as log:
         return subprocess.Popen(  # noqa: S603 - this program
-            [sys.executable, "-u", __file__, *given, "--part", part.name],
+            [sys.executable, "-u", __file__, *arguments, "--part", part.name],
             stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
 
 
 def run(part: Part, options: argparse.Namespace) -> None:
-    """Run a part, once it is its turn."""
-    given = part.arguments.replace("OFFICIAL", str(options.official))
+    """Run a part in this process, after a line has arrived on standard input."""
+    arguments = part.arguments.replace("OFFICIAL", str(options.official))
     if options.quick:
-        for ours, small in _QUICK.items():
-            given = given.replace(ours, small)
+        for full, quick in _QUICK.items():
+            arguments = arguments.replace(full, quick)
     benchmark = importlib.import_module(part.benchmark)
-    if not sys.stdin.readline():  # the parent has ended
+    if not sys.stdin.readline():  # the parent process has exited
         return
-    benchmark.main([*given.split(), "--json", str(options.out / f"{part.name}.json")])
+    benchmark.main([*arguments.split(), "--json", str(options.out / f"{part.name}.json")])
 
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/gpu"), help="folder for logs and metrics")
-    parser.add_argument("--official", type=Path, default=BESIDE, help="checkout (default: ../vjepa2)")
+    parser.add_argument("--official", type=Path, default=DEFAULT_CHECKOUT, help="checkout (default: ../vjepa2)")
     parser.add_argument("--quick", action="store_true", help="tiny sizes on the CPU, to test the program")
     parser.add_argument("--only", nargs="+", choices=[part.name for part in PARTS], help="parts to run (default: all)")
     parser.add_argument("--part", help=argparse.SUPPRESS)

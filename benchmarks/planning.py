@@ -4,26 +4,26 @@
     python benchmarks/planning.py --official ../vjepa2 --threads 1
     python benchmarks/planning.py --device cuda --at-once 32 64 128 --official ../vjepa2   # the paper's setting
 
-A decision is a whole search by the cross-entropy method, from latents to actions; encoding the picture is not part of
-it. On CUDA the default is the paper's: 800 samples x 10 iterations, horizon 1 and 2, all 24 layers, bfloat16.
+A decision is a complete search by the cross-entropy method, from latents to actions, without the encoding of the image.
+On CUDA the default is the paper's setting: 800 samples x 10 iterations, horizon 1 and 2, all 24 layers, bfloat16.
 
-plain      the same planner with everything computed again for each step, and poses by SciPy, one after the other
-official   the planner of the official notebook on the official predictor, where a checkout of facebookresearch/vjepa2
-           is at --official (`official_planner.py`)
-ours/N     ours, N samples through the predictor at once; plain takes as many as the first of these. With --compile
-           once more with compiled blocks (`planning.compile`): N+compiled. The first N once
-           more with a float32 LoRA on, made ready as `plan RUN` does it: N+adapter (--no-adapter: not)
+plain      the same planner without optimisations: all steps are computed again for each step, poses one by one by SciPy
+official   the planner and the predictor of the official notebook (`official_planner.py`); needs a checkout of
+           facebookresearch/vjepa2 at --official
+ours/N     this package with N samples per call of the predictor; plain uses the first N. N+compiled: with compiled
+           blocks (`planning.compile`), if --compile is set. N+adapter: the first N with a float32 LoRA, prepared as in
+           `plan RUN`, unless --no-adapter is set
 
-Before anything is timed all must choose the same actions, on the same weights with the same seed,
-in float32: what chooses others, or finds other energies, gets no ratio. A ratio over 1 means faster than plain, or than
-the official one. All take turns; on a CPU the process's own time over its threads counts, else wall time; the median,
-and the fastest. MFU: the model FLOPs of `training.flops` over what the device does in a product of matrices,
-measured first; the same for every way. `retries`: how often the allocator had to give memory back while a way was
-timed, whose time then does not count. Peak memory, weights included, is of two decisions in a pass of its own, after
-all times: each line alone on the device, or on a CPU in a process of its own.
+A variant is compared only if it selects the same actions with the same energies in float32, with the same weights and
+seed. A ratio above 1 means faster than plain or official. The variants take turns. On a CPU the process time divided by
+the number of threads is measured, otherwise wall time; the table shows the median and the shortest time. `MFU` is the
+number of model FLOPs (FLOPs of `training.flops`, the same for all variants), divided by the FLOPs that the device
+computes in the same time in a matrix product. `retries` counts how often the allocator had to release memory while a
+variant was timed; its time is then invalid. The peak memory of two decisions, including the weights, is measured after
+all times: each line alone on the device, or in a new process on a CPU.
 
---json is written after every round. What runs out of memory says so; what fails otherwise, too, and the exit status is
-1 then, when all else was measured.
+--json is written after every round. A variant that runs out of memory or fails is reported, and the others continue.
+After any other failure than a lack of memory the exit status is 1.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
-from decision_ways import OFFICIAL, PLAIN, Way
-from memory import is_expandable, let_go, peak_alone, peak_gb
+from decision_variants import OFFICIAL, PLAIN, Variant
+from memory import is_expandable, measure_peak_alone, measure_peak_gb, release_memory
 from official_planner import PLANNER
 from planning_variants import Bench
-from rows import Row, Rows, cell
+from rows import Row, Rows, format_cell
 from timing import (
     PROFILED_ROWS,
-    Turns,
-    about,
+    Timings,
     add_options,
-    introduction,
-    prepare,
-    profiled,
-    ratio,
-    rounds,
-    self_time,
-    settle,
+    apply_defaults,
+    compute_speed_up,
+    describe_machine,
+    describe_run,
+    profile_step,
+    self_time_key,
+    set_up_torch,
+    time_rounds,
 )
 
 from vjepa2_ac.distributed import measure_matmul_speed
@@ -62,133 +62,139 @@ QUICK = {
 }  # fmt: skip
 _ON_CPU = {"layers": 2, "samples": 8, "iterations": 2, "horizon": [2, 4], "at_once": [8], "dtype": ["float32"]}
 _ON_CUDA = {"layers": 24, "samples": 800, "iterations": 10, "horizon": [1, 2], "at_once": [64], "dtype": ["bfloat16"]}
-_NAMES = f"{'horizon':>7}  {'way':22}"
+_NAMES = f"{'horizon':>7}  {'variant':22}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a line for each horizon and way: seconds a decision, MFU, ratios to plain and official; peak memory."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    options = parse(given)
-    prepare(options)
+    """Print a line for each horizon and variant: times, MFU, ratios to plain and official, peak memory."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    options = parse(arguments)
+    set_up_torch(options)
     if options.memory_of:
-        way = Way(options.memory_of[0], int(options.memory_of[1]))
-        print(json.dumps(memory_of_way(options, options.dtype[0], options.horizon[0], way)))
+        variant = Variant(options.memory_of[0], int(options.memory_of[1]))
+        print(json.dumps(measure_variant_memory(options, options.dtype[0], options.horizon[0], variant)))
         return
     _introduce(options)
-    rows = Rows(options.json, **about(options, given))
+    rows = Rows(options.json, **describe_run(options, arguments))
     for dtype in options.dtype:
-        rows.attempt(partial(measure, options, given, dtype, rows), dtype=dtype)
+        rows.attempt(partial(measure, options, arguments, dtype, rows), dtype=dtype)
     rows.finish()
 
 
-def measure(options: argparse.Namespace, given: list[str], dtype: str, rows: Rows) -> None:
-    """Measure all horizons in one precision: first time, then memory."""
-    ways = measure_time(options, dtype, rows)
-    let_go(options.device)
+def measure(options: argparse.Namespace, arguments: list[str], dtype: str, rows: Rows) -> None:
+    """Measure all horizons in one precision: first the times, then the memory."""
+    variants = measure_time(options, dtype, rows)
+    release_memory(options.device)
     if options.memory:
         print(f"{dtype}, memory\n{_NAMES}{'peak GB':>12}")
-        for horizon, same in ways.items():
-            for way in same:
-                row = memory_row(options, given, dtype, horizon, way)
+        for horizon, variants_of_horizon in variants.items():
+            for variant in variants_of_horizon:
+                row = measure_memory_row(options, arguments, dtype, horizon, variant)
                 rows.add(row)
-                print(memory_line(row), flush=True)
+                print(format_memory_line(row), flush=True)
 
 
-def measure_time(options: argparse.Namespace, dtype: str, rows: Rows) -> dict[int, list[Way]]:
-    """Time all horizons, if that is asked for, and return the ways of each; nothing stays on the device."""
+def measure_time(options: argparse.Namespace, dtype: str, rows: Rows) -> dict[int, list[Variant]]:
+    """Time all horizons, if --time is set, and return the compared variants of each horizon."""
     bench = Bench(options, dtype)
     rows.about["expandable_segments"] = is_expandable(options.device)
-    ways = {horizon: same_ways(bench, horizon, rows) for horizon in options.horizon}  # before ours takes its own type
+    # The comparison is in float32, before the first decision casts the weights.
+    variants = {horizon: select_matching_variants(bench, horizon, rows) for horizon in options.horizon}
     if options.time:
         ceiling = measure_matmul_speed(bench.device, bench.dtype)
         print(f"{dtype}: ceiling {ceiling / 1e12:.3g} TFLOP/s")
         titles = ("s/decision", "min", "samples/s", "MFU", "retries", "of plain", "of official")
         print(_NAMES + "".join(f"{title:>12}" for title in titles))
-        for horizon, same in ways.items():
-            named = {"dtype": dtype, "horizon": horizon}
-            rows.attempt(partial(time_horizon, bench, horizon, same, ceiling, rows), **named)
-    return ways
+        for horizon, variants_of_horizon in variants.items():
+            work = partial(time_horizon, bench, horizon, variants_of_horizon, ceiling, rows)
+            rows.attempt(work, dtype=dtype, horizon=horizon)
+    return variants
 
 
-def time_horizon(bench: Bench, horizon: int, same: Sequence[Way], ceiling: float, rows: Rows) -> None:
-    """Add a row for each way, and if that is asked for one of where the time goes in the last one."""
+def time_horizon(bench: Bench, horizon: int, variants: Sequence[Variant], ceiling: float, rows: Rows) -> None:
+    """Add a row for each variant, and with --profile a profile of the last variant."""
     device = bench.options.device
-    let_go(device)
-    seen: dict[str, Turns] = {}  # nothing before the first round is over
+    release_memory(device)
+    timings: dict[str, Timings] = {}  # empty until the first timed round is finished
 
-    def rows_so_far() -> list[Row]:
-        return [time_row(bench, horizon, way, seen, ceiling) for way in same]
+    def make_rows() -> list[Row]:
+        return [make_time_row(bench, horizon, variant, timings, ceiling) for variant in variants]
 
-    decisions = {way.name: bench.decision(way, horizon) for way in same}
-    for so_far in rounds(decisions, bench.options, partial(let_go, device)):
-        seen = so_far
-        rows.so_far(*rows_so_far())
-    for row in rows_so_far():
+    decisions = {variant.name: bench.make_decision(variant, horizon) for variant in variants}
+    for timings_so_far in time_rounds(decisions, bench.options, partial(release_memory, device)):
+        timings.update(timings_so_far)
+        rows.write_unfinished(*make_rows())
+    for row in make_rows():
         rows.add(row)
-        print(time_line(row), flush=True)
+        print(format_time_line(row), flush=True)
     if bench.options.profile:
-        named = {"measured": "profile", "horizon": horizon, "way": same[-1].name}
-        rows.attempt(partial(profile_decision, decisions[same[-1].name], bench, rows, named), **named)
+        about = {"measured": "profile", "horizon": horizon, "variant": variants[-1].name}
+        rows.attempt(partial(profile_decision, decisions[variants[-1].name], bench, rows, about), **about)
 
 
-def time_row(bench: Bench, horizon: int, way: Way, seen: Mapping[str, Turns], ceiling: float) -> Row:
-    """Return what was seen of a way so far."""
-    turns = seen.get(way.name)
-    figures = (turns or Turns()).figures()
-    seconds = figures["s"]
+def make_time_row(
+    bench: Bench, horizon: int, variant: Variant, all_timings: Mapping[str, Timings], ceiling: float
+) -> Row:
+    """Return the row of a variant after the rounds so far. `all_timings` are those of all variants, by name."""
+    timings = all_timings.get(variant.name)
+    metrics = (timings or Timings()).metrics()
+    seconds = metrics["s"]
     return {
         "measured": "time", "dtype": str(bench.dtype).removeprefix("torch."), "ceiling": ceiling, "horizon": horizon,
-        "way": way.name, "at_once": way.at_once, **figures, "samples_per_s": seconds and bench.sequences / seconds,
+        "variant": variant.name, "at_once": variant.at_once, **metrics,
+        "samples_per_s": seconds and bench.sequences / seconds,
         "mfu": seconds and bench.flops(horizon) / seconds / ceiling,
-        **{f"ratio_to_{base}": ratio(seen.get(base), turns) for base in (PLAIN, OFFICIAL)},
+        **{f"ratio_to_{base}": compute_speed_up(all_timings.get(base), timings) for base in (PLAIN, OFFICIAL)},
     }  # fmt: skip
 
 
-def time_line(row: Row) -> str:
-    """Return a row of the table of times."""
+def format_time_line(row: Row) -> str:
+    """Return a line of the table of times."""
     if row["problem"]:
-        return f"{names_of(row)}{row['problem']}"
-    text = f"{names_of(row)}{row['s']:12.3f}{row['min_s']:12.3f}{row['samples_per_s']:12.2f}{row['mfu']:12.1%}"
-    ratios = "".join(cell(row[f"ratio_to_{base}"], 12, ".2f") for base in (PLAIN, OFFICIAL))
+        return f"{format_names(row)}{row['problem']}"
+    text = f"{format_names(row)}{row['s']:12.3f}{row['min_s']:12.3f}{row['samples_per_s']:12.2f}{row['mfu']:12.1%}"
+    ratios = "".join(format_cell(row[f"ratio_to_{base}"], 12, ".2f") for base in (PLAIN, OFFICIAL))
     return f"{text}{row['alloc_retries']:12}{ratios}"
 
 
-def profile_decision(decide: Callable[[], object], bench: Bench, rows: Rows, named: Row) -> None:
-    """Add and print where the time of a decision goes, and on CUDA how often the host waits for the device in it."""
+def profile_decision(decide: Callable[[], object], bench: Bench, rows: Rows, about: Row) -> None:
+    """Add and print the profile of a decision, and on CUDA how often the host waits for the device."""
     device = bench.options.device
-    found = profiled(decide, device)
-    rows.add({**named, "waits": found.waits, "dearest": found.dearest(device)})
-    print(found.events.table(sort_by=self_time(device), row_limit=PROFILED_ROWS, max_name_column_width=40))
+    profile = profile_step(decide, device)
+    rows.add({**about, "waits": profile.waits, "slowest": profile.slowest(device)})
+    print(profile.events.table(sort_by=self_time_key(device), row_limit=PROFILED_ROWS, max_name_column_width=40))
     if device != "cpu":
-        print(f"host synchronisations in {bench.options.iterations} iterations: {found.waits}")
+        print(f"host synchronisations in {bench.options.iterations} iterations: {profile.waits}")
 
 
-def memory_row(options: argparse.Namespace, given: list[str], dtype: str, horizon: int, way: Way) -> Row:
-    """Return the peak of a way."""
-    own = ["--horizon", str(horizon), "--dtype", dtype, "--memory-of", way.name, str(way.at_once)]
-    alone = partial(memory_of_way, options, dtype, horizon, way)
+def measure_memory_row(
+    options: argparse.Namespace, arguments: list[str], dtype: str, horizon: int, variant: Variant
+) -> Row:
+    """Return a row with the peak memory of a variant."""
+    own_arguments = ["--horizon", str(horizon), "--dtype", dtype, "--memory-of", variant.name, str(variant.at_once)]
+    measure = partial(measure_variant_memory, options, dtype, horizon, variant)
     return {
-        "measured": "memory", "dtype": dtype, "horizon": horizon, "way": way.name,
-        **peak_alone(alone, [__file__, *given, *own], options.device),
+        "measured": "memory", "dtype": dtype, "horizon": horizon, "variant": variant.name,
+        **measure_peak_alone(measure, [__file__, *arguments, *own_arguments], options.device),
     }  # fmt: skip
 
 
-def memory_of_way(options: argparse.Namespace, dtype: str, horizon: int, way: Way) -> float:
-    """Return the peak in 10^9 bytes of two decisions of one way, with nothing of the others in memory."""
+def measure_variant_memory(options: argparse.Namespace, dtype: str, horizon: int, variant: Variant) -> float:
+    """Return the peak memory of two decisions of one variant in 10^9 bytes, without the other variants in memory."""
     bench = Bench(options, dtype)
-    decide = bench.decision(way, horizon)
-    bench.keep_only(way)
-    return peak_gb(decide, options.device)
+    decide = bench.make_decision(variant, horizon)
+    bench.keep_only(variant)
+    return measure_peak_gb(decide, options.device)
 
 
-def memory_line(row: Row) -> str:
-    """Return a row of the table of memory."""
-    return names_of(row) + (row["problem"] or f"{row['peak_gb']:12.2f}")
+def format_memory_line(row: Row) -> str:
+    """Return a line of the table of memory."""
+    return format_names(row) + (row["problem"] or f"{row['peak_gb']:12.2f}")
 
 
-def names_of(row: Row) -> str:
-    """Return the beginning of a row of a table: what horizon, and which way."""
-    return f"{row['horizon']:7}  {row['way']:22}"
+def format_names(row: Row) -> str:
+    """Return the first columns of a line: the horizon and the variant."""
+    return f"{row['horizon']:7}  {row['variant']:22}"
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -222,44 +228,44 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     options = parser.parse_args(arguments)
     defaults = _ON_CPU if options.device == "cpu" else _ON_CUDA
     vars(options).update({name: value for name, value in defaults.items() if getattr(options, name) is None})
-    return settle(options, QUICK)
+    return apply_defaults(options, QUICK)
 
 
-def same_ways(bench: Bench, horizon: int, rows: Rows) -> list[Way]:
-    """Return the ways to compare: those that choose the same actions."""
-    same = []
-    for way in candidates(bench):
-        named = {"measured": "same actions", "horizon": horizon, "way": way.name}
-        if rows.attempt(partial(chooses_the_same, bench, way, horizon, rows, named), **named):
-            same.append(way)
-    return same
+def select_matching_variants(bench: Bench, horizon: int, rows: Rows) -> list[Variant]:
+    """Return the variants that select the same actions as this package, which are compared."""
+    matching = []
+    for variant in list_variants(bench):
+        about = {"measured": "same actions", "horizon": horizon, "variant": variant.name}
+        if rows.attempt(partial(selects_same_actions, bench, variant, horizon, rows, about), **about):
+            matching.append(variant)
+    return matching
 
 
-def chooses_the_same(bench: Bench, way: Way, horizon: int, rows: Rows, named: Row) -> bool:
-    """Return whether a variant chooses the same actions as this package, and print the result."""
-    found = bench.difference(way, horizon)
-    rows.add({**named, "difference": str(found), "is_none": found.is_none})
-    told = "" if found.is_none else ". No ratio is reported, because the actions differ"
-    print(f"horizon {horizon}, {way.name}: {found} (float32){told}")
-    return found.is_none
+def selects_same_actions(bench: Bench, variant: Variant, horizon: int, rows: Rows, about: Row) -> bool:
+    """Return whether a variant selects the same actions as this package, and print the result."""
+    difference = bench.difference(variant, horizon)
+    rows.add({**about, "difference": str(difference), "is_rounding": difference.is_rounding})
+    consequence = "" if difference.is_rounding else ". No ratio is reported, because the actions differ"
+    print(f"horizon {horizon}, {variant.name}: {difference} (float32){consequence}")
+    return difference.is_rounding
 
 
-def candidates(bench: Bench) -> list[Way]:
+def list_variants(bench: Bench) -> list[Variant]:
     """Return all requested variants."""
     options = bench.options
     kinds = (False, True) if options.compile else (False,)
-    ours = [Way.ours(count, compiled=compiled) for count in options.at_once for compiled in kinds]
-    adapted = [Way.ours(options.at_once[0], compiled=compiled, adapter=True) for compiled in kinds]
-    official = [Way(OFFICIAL, options.samples)] if bench.has_official else []
+    ours = [Variant.ours(count, compiled=compiled) for count in options.at_once for compiled in kinds]
+    adapted = [Variant.ours(options.at_once[0], compiled=compiled, adapter=True) for compiled in kinds]
+    official = [Variant(OFFICIAL, options.samples)] if bench.has_official else []
     if not official:
         print(f"official: skipped, needs {options.official / PLANNER}, found no such file")
-    return [Way(PLAIN, options.at_once[0]), *official, *ours, *(adapted if options.adapter else ())]
+    return [Variant(PLAIN, options.at_once[0]), *official, *ours, *(adapted if options.adapter else ())]
 
 
 def _introduce(options: argparse.Namespace) -> None:
-    load = ", ".join(f"{one:.1f}" for one in os.getloadavg())
+    load = ", ".join(f"{average:.1f}" for average in os.getloadavg())
     print(
-        f"{introduction(options)}, load {load};"
+        f"{describe_machine(options)}, load {load};"
         f" {options.layers} layers of width {options.width}, {options.image_size} px, {options.samples} samples x"
         f" {options.iterations} iterations, {options.repeats} repeats after {options.warm_up}"
     )

@@ -1,4 +1,4 @@
-"""Collect the rows of a benchmark and write each to disk at once; after a failed row the others continue."""
+"""Collect the rows of a benchmark, and write each row to disk at once. A failed row does not stop the benchmark."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ Result = TypeVar("Result")
 
 OUT_OF_MEMORY = "out of memory"  # a result, not a failure
 FAILED = "failed"
-_LONGEST = 200  # characters of an error in a row
+_MAX_PROBLEM_CHARACTERS = 200  # maximum length of an error in a row
 
 
 class Rows:
     """All rows of a benchmark. The file is replaced atomically, so an interruption keeps the previous rows.
 
     Args:
-        file: Where rows are written as JSON; None: nowhere.
-        about: What holds for all of them.
+        file: The JSON file to which rows are written; None: no file.
+        about: Values that are the same for all rows.
     """
 
     def __init__(self, file: Path | None, **about: Any) -> None:
@@ -35,55 +35,55 @@ class Rows:
         self._rows: list[Row] = []
 
     def add(self, *rows: Row) -> None:
-        """Keep rows for good."""
+        """Add finished rows, and write the file."""
         self._rows += rows
-        self.so_far()
+        self.write_unfinished()
 
-    def so_far(self, *rows: Row) -> None:
-        """Write the rows that were added, and after them some that are not finished; those are not kept."""
+    def write_unfinished(self, *rows: Row) -> None:
+        """Write the added rows, followed by unfinished rows. The next write omits the unfinished rows."""
         if self._file is not None:
-            whole = {**self.about, "rows": [*self._rows, *({**row, "finished": False} for row in rows)]}
-            write_atomically(self._file, json.dumps(_finite(whole), indent=1) + "\n")
+            content = {**self.about, "rows": [*self._rows, *({**row, "finished": False} for row in rows)]}
+            write_atomically(self._file, json.dumps(_replace_non_finite(content), indent=1) + "\n")
 
     def attempt(self, work: Callable[[], Result], **about: Any) -> Result | None:
-        """Return what work returns, or None where it fails; that is a row of its own then, and is printed."""
+        """Return the result of `work`. If it fails, add and print a row with the problem, and return None."""
         try:
             return work()
         except Exception as error:
-            row = {**about, "problem": problem_of(error)}
+            row = {**about, "problem": describe_failure(error)}
         print(", ".join(str(value) for value in row.values()), flush=True)
         self.add(row)
         return None
 
     def finish(self) -> None:
-        """End the program with an error if any row has failed.
+        """Exit with an error if any row has failed.
 
         Raises:
-            SystemExit: One has.
+            SystemExit: A row has failed.
         """
         failed = sum(any(str(value).startswith(FAILED) for value in row.values()) for row in self._rows)
         if failed:
             raise SystemExit(f"{failed} of {len(self._rows)} rows failed")
 
 
-def problem_of(error: Exception) -> str:
-    """Return what a row says of an error, whose traceback is printed: out of memory, or failed and why."""
-    if isinstance(error, torch.OutOfMemoryError) or OUT_OF_MEMORY in str(error):  # CUDA's own is a RuntimeError
+def describe_failure(error: Exception) -> str:
+    """Return the text for an error in a row: out of memory, or failed with the reason, whose traceback is printed."""
+    if isinstance(error, torch.OutOfMemoryError) or OUT_OF_MEMORY in str(error):  # CUDA raises a RuntimeError
         return OUT_OF_MEMORY
     traceback.print_exception(error, file=sys.stderr)
     lines = str(error).strip().splitlines() or [""]
-    return f"{FAILED}: {type(error).__name__}: {lines[0]}"[:_LONGEST]
+    return f"{FAILED}: {type(error).__name__}: {lines[0]}"[:_MAX_PROBLEM_CHARACTERS]
 
 
-def cell(value: float | None, width: int, form: str) -> str:
-    """Return a number as wide as its column, a dash where there is none."""
+def format_cell(value: float | None, width: int, form: str) -> str:
+    """Return a number, right-aligned in the width of its column; a dash for None."""
     return f"{'-' if value is None else format(value, form):>{width}}"
 
 
-def _finite(value: Any) -> Any:
-    """Return what JSON can hold: null where a number is none."""
+def _replace_non_finite(value: Any) -> Any:
+    """Replace NaN and infinity, which JSON does not support, by None."""
     if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
+        return {key: _replace_non_finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
+        return [_replace_non_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,30 +1,31 @@
-"""Measure time and utilisation of a training step, compared with the official predictor's.
+"""Measure time, memory and utilisation of a training step, compared with the official code.
 
     python benchmarks/train_step.py --layers 4 --frames 8 16 --dtype float32 bfloat16 --official ../vjepa2
     python benchmarks/train_step.py --device cuda --batch 1 2 8 --checkpointing off on --attention auto per_step dense
     python benchmarks/train_step.py --device cuda --source cache pixels --batch 2 8 largest --cap-gb 24 --compile \
         --official ../vjepa2 --full --json benchmarks/results/train_step.json --profile
 
-Ours is `training_step` itself on a LoRA of rank 16: loss, gradients, clipping, AdamW; latents are there already, or
-with --source pixels are computed in the step. The baseline is the same step of the official code with plain PEFT LoRA
-(`official_predictor.py`), where a checkout of facebookresearch/vjepa2 is at --official; before anything is timed both
-must give the same loss and gradients on the same weights, else there is no ratio to it. Without a checkout the
-baseline is our own step with a dense mask. A ratio over 1 means faster than the baseline.
+The step of this package is `training_step` with a LoRA of rank 16: loss, gradients, clipping, AdamW. Latents are
+cached, or computed in the step with --source pixels. The baseline is the same step of the official code with plain PEFT
+LoRA (`official_predictor.py`); it needs a checkout of facebookresearch/vjepa2 at --official. A ratio is reported only
+if both steps give the same loss and gradients with the same weights. Without a checkout the baseline is the step of
+this package with a dense mask. A ratio above 1 means faster than the baseline.
 
-All take turns, so that a busy machine slows them alike. On a CPU the process's own time over its threads counts, else
-wall time; `ms` is the median, `min` the fastest. MFU: the model FLOPs of `training.flops` over what the device
-does in a product of matrices, measured first. `retries`: how often the allocator had to give memory back while a way
-was timed, whose time then does not count. --profile counts, in a step of each way of ours, how often the host waits
-for the device, how long its kernels ran, and what was compiled after warm-up; beside it the seconds of a setting's
-first step, which compiles (it counts for the first setting of a process only). Loss and norm of the gradients must be
-the same for all ways of ours, but for bfloat16's rounding.
+The variants take turns, so that load on the machine slows all of them equally. On a CPU the process time divided by the
+number of threads is measured, otherwise wall time. `ms` is the median, `min` the shortest time. `MFU` is the number of
+model FLOPs (`training.flops`), divided by the FLOPs that the device computes in the same time in a matrix product.
+`retries` counts how often the allocator had to release memory while a variant was timed; its time is then invalid.
+--profile counts how often the host waits for the device in a step, and measures the duration of the kernels. It also
+reports the number of graphs compiled after the warm-up, and the duration of the first step, which includes compilation
+in the first setting of a process. The variants of this package must have the same loss and gradient norm, up to the
+rounding of bfloat16.
 
-Peak memory, weights included, is of two steps in a pass of its own, after all times: each line alone on the device, or
-on a CPU in a process of its own. Beside it, what `doctor` estimates for our run of that setting, and by how much that
-is too much. --cap-gb holds there, and where the largest batch is looked for; not while anything is timed.
+The peak memory of two steps, including the weights, is measured after all times: each line alone on the device, or in a
+new process on a CPU. The table compares it with the estimate of `doctor`. --cap-gb limits the memory in this pass and
+in the search for the largest batch, but not while steps are timed.
 
---json is written after every round. What runs out of memory says so; what fails otherwise, too, and the exit status is
-1 then, when all else was measured.
+--json is written after every round. A variant that runs out of memory or fails is reported, and the others continue.
+After any other failure than a lack of memory the exit status is 1.
 """
 
 from __future__ import annotations
@@ -37,12 +38,31 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 
-from memory import is_expandable, let_go
+from memory import is_expandable, release_memory
 from official_predictor import PREDICTOR
-from rows import Row, Rows, cell, problem_of
-from step_memory import MEMORY_TITLES, NAMES, asked, found, memory_line, memory_of_way, memory_row, names_of
-from timing import Turns, about, add_options, introduction, prepare, profiled, ratio, rounds, settle
-from train_step_variants import OFFICIAL, OFFICIAL_FULL, PRECISIONS, Bench, Setting, Started, has_checkout, our_ways
+from rows import Row, Rows, describe_failure, format_cell
+from step_memory import (
+    MEMORY_TITLES,
+    NAMES,
+    format_memory_line,
+    format_names,
+    list_settings,
+    measure_memory_row,
+    measure_variant_memory,
+    resolve_batch,
+)
+from timing import (
+    Timings,
+    add_options,
+    apply_defaults,
+    compute_speed_up,
+    describe_machine,
+    describe_run,
+    profile_step,
+    set_up_torch,
+    time_rounds,
+)
+from train_step_variants import OFFICIAL, OFFICIAL_FULL, PRECISIONS, Bench, Setting, WarmUp, has_checkout, our_variants
 
 from vjepa2_ac.distributed import measure_matmul_speed
 from vjepa2_ac.model.lora import trainable_report
@@ -54,109 +74,124 @@ QUICK = {
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a line for each setting and way: milliseconds, clips a second, MFU, ratio to the baseline; peak memory."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    options = parse(given)
-    prepare(options)
+    """Print a line for each setting and variant: times, clips per second, MFU, ratio to the baseline, peak memory."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    options = parse(arguments)
+    set_up_torch(options)
     if options.memory_of:
-        (setting,) = asked(options)
-        print(json.dumps(memory_of_way(options, options.dtype[0], setting, options.memory_of)))
+        (setting,) = list_settings(options)
+        print(json.dumps(measure_variant_memory(options, options.dtype[0], setting, options.memory_of)))
         return
     _introduce(options)
-    rows = Rows(options.json, **about(options, given))
+    rows = Rows(options.json, **describe_run(options, arguments))
     for dtype in options.dtype:
-        rows.attempt(partial(measure, options, given, dtype, rows), dtype=dtype)
+        rows.attempt(partial(measure, options, arguments, dtype, rows), dtype=dtype)
     rows.finish()
 
 
-def measure(options: argparse.Namespace, given: list[str], dtype: str, rows: Rows) -> None:
-    """Measure all settings in one precision: first time, then memory."""
-    settings = [setting for one in asked(options) for setting in found(options, dtype, one, rows)]
-    ways = measure_time(options, dtype, settings, rows)
-    let_go(options.device)
+def measure(options: argparse.Namespace, arguments: list[str], dtype: str, rows: Rows) -> None:
+    """Measure all settings in one precision: first the times, then the memory."""
+    settings = [
+        setting for requested in list_settings(options) for setting in resolve_batch(options, dtype, requested, rows)
+    ]
+    variants = measure_time(options, dtype, settings, rows)
+    release_memory(options.device)
     if options.memory:
         print(f"{dtype}, memory\n{MEMORY_TITLES}")
-        for setting, way in itertools.product(settings, ways):
-            row = memory_row(options, given, dtype, setting, way)
+        for setting, variant in itertools.product(settings, variants):
+            row = measure_memory_row(options, arguments, dtype, setting, variant)
             rows.add(row)
-            print(memory_line(row), flush=True)
+            print(format_memory_line(row), flush=True)
 
 
 def measure_time(options: argparse.Namespace, dtype: str, settings: Sequence[Setting], rows: Rows) -> list[str]:
-    """Time all settings, if that is asked for, and return the ways that are compared; nothing stays on the device."""
+    """Time all settings, if --time is set, and return the names of the compared variants."""
     bench = Bench(options, dtype)
-    ways = choose_ways(bench, options, rows)
+    variants = choose_variants(bench, options, rows)
     rows.about["expandable_segments"] = is_expandable(options.device)
     if options.time:
         ceiling = measure_matmul_speed(bench.device, bench.dtype)
         print(f"{dtype}: ceiling {ceiling / 1e12:.3g} TFLOP/s")
-        titles = f"{'ms':>9}{'min':>9}{'clips/s':>9}{'MFU':>8}{'retries':>8}{f'of {ways[0]}':>15}"
+        titles = f"{'ms':>9}{'min':>9}{'clips/s':>9}{'MFU':>8}{'retries':>8}{f'of {variants[0]}':>15}"
         print(f"{NAMES}{titles}{'loss':>10}{'gradients':>10}")
         for setting in settings:
-            rows.attempt(partial(time_setting, bench, setting, ways, ceiling, rows), dtype=dtype, **asdict(setting))
-    return ways
+            rows.attempt(partial(time_setting, bench, setting, variants, ceiling, rows), dtype=dtype, **asdict(setting))
+    return variants
 
 
-def time_setting(bench: Bench, setting: Setting, ways: Sequence[str], ceiling: float, rows: Rows) -> None:
-    """Add a row for each way."""
-    let_go(bench.options.device)
-    before = compiled_graphs()
-    started = {way: bench.start(setting, way) for way in ways}
-    warm = compiled_graphs()
-    seen: dict[str, Turns] = {}  # nothing before the first round is over
+def time_setting(bench: Bench, setting: Setting, variants: Sequence[str], ceiling: float, rows: Rows) -> None:
+    """Add a row for each variant."""
+    release_memory(bench.options.device)
+    before = count_compiled_graphs()
+    warm_ups = {variant: bench.warm_up(setting, variant) for variant in variants}
+    after_warm_up = count_compiled_graphs()
+    timings: dict[str, Timings] = {}  # empty until the first timed round is finished
 
-    def rows_so_far() -> list[Row]:
-        base = seen.get(ways[0])
-        return [time_row(bench, setting, way, started[way], seen.get(way), base, ceiling) for way in ways]
+    def make_rows() -> list[Row]:
+        base = timings.get(variants[0])
+        return [
+            make_time_row(bench, setting, variant, warm_ups[variant], timings.get(variant), base, ceiling)
+            for variant in variants
+        ]
 
-    steps = {way: one.step for way, one in started.items() if one.step}
-    for so_far in rounds(steps, bench.options, bench.let_go_of_a_step):
-        seen = so_far
-        rows.so_far(*rows_so_far())
-    compiled = {"compiled_in_warm_up": warm - before, "compiled_after": compiled_graphs() - warm}
-    for row in rows_so_far():
-        if row["problem"] is None and bench.options.profile and row["way"] not in {OFFICIAL, OFFICIAL_FULL}:
-            row |= {**compiled, **seen_by_the_profiler(steps[row["way"]], bench)}
+    steps = {variant: warm_up.step for variant, warm_up in warm_ups.items() if warm_up.step}
+    for timings_so_far in time_rounds(steps, bench.options, bench.clear_failed_step):
+        timings.update(timings_so_far)
+        rows.write_unfinished(*make_rows())
+    compiled = {
+        "compiled_in_warm_up": after_warm_up - before,
+        "compiled_after": count_compiled_graphs() - after_warm_up,
+    }
+    for row in make_rows():
+        if row["problem"] is None and bench.options.profile and row["variant"] not in {OFFICIAL, OFFICIAL_FULL}:
+            row |= {**compiled, **profile_row(steps[row["variant"]], bench)}
         rows.add(row)
-        print(time_line(row), flush=True)
+        print(format_time_line(row), flush=True)
 
 
-def time_row(
-    bench: Bench, setting: Setting, way: str, started: Started, turns: Turns | None, base: Turns | None, ceiling: float
+def make_time_row(
+    bench: Bench,
+    setting: Setting,
+    variant: str,
+    warm_up: WarmUp,
+    timings: Timings | None,
+    base: Timings | None,
+    ceiling: float,
 ) -> Row:
-    """Return what was seen of a way so far."""
-    figures = (turns or Turns(failure=started.problem)).figures()
-    seconds = figures["s"]
-    flops = setting.batch * bench.flops_per_clip(setting, way)
+    """Return the row of a variant after the rounds so far. `base` are the timings of the baseline."""
+    metrics = (timings or Timings(failure=warm_up.problem)).metrics()
+    seconds = metrics["s"]
+    flops = setting.batch * bench.flops_per_clip(setting, variant)
     return {
         "measured": "time", "dtype": str(bench.dtype).removeprefix("torch."), "ceiling": ceiling, **asdict(setting),
-        "way": way, **figures, "first_s": started.first_s, **started.found, "ratio": ratio(base, turns),
+        "variant": variant, **metrics, "first_s": warm_up.first_s, **warm_up.metrics,
+        "ratio": compute_speed_up(base, timings),
         "clips_per_s": seconds and setting.batch / seconds, "mfu": seconds and flops / seconds / ceiling,
     }  # fmt: skip
 
 
-def seen_by_the_profiler(step: Callable[[], object], bench: Bench) -> Row:
-    """Return how often the host waits for the device in a step, and its dearest kernels, or how profiling failed."""
+def profile_row(step: Callable[[], object], bench: Bench) -> Row:
+    """Return how often the host waits for the device in a step, and the slowest kernels; or why profiling failed."""
     try:
-        found = profiled(step, bench.options.device)
+        profile = profile_step(step, bench.options.device)
         return {
-            "waits": sum(found.waits.values()),
-            "busy_ms": found.busy_ms(),
-            "dearest": found.dearest(bench.options.device),
+            "waits": sum(profile.waits.values()),
+            "busy_ms": profile.busy_ms(),
+            "slowest": profile.slowest(bench.options.device),
         }
     except Exception as error:
-        problem = problem_of(error)
-    bench.let_go_of_a_step()
+        problem = describe_failure(error)
+    bench.clear_failed_step()
     return {"waits": problem}
 
 
-def time_line(row: Row) -> str:
-    """Return a row of the table of times."""
+def format_time_line(row: Row) -> str:
+    """Return a line of the table of times."""
     if row["problem"]:
-        return f"{names_of(row)}{row['problem']}"
-    milliseconds = "".join(cell(row[key] * 1e3, 9, ".1f") for key in ("s", "min_s"))
-    text = f"{names_of(row)}{milliseconds}{row['clips_per_s']:9.3f}{row['mfu']:8.1%}{row['alloc_retries']:8}"
-    text += cell(row["ratio"], 15, ".2f")
+        return f"{format_names(row)}{row['problem']}"
+    milliseconds = "".join(format_cell(row[key] * 1e3, 9, ".1f") for key in ("s", "min_s"))
+    text = f"{format_names(row)}{milliseconds}{row['clips_per_s']:9.3f}{row['mfu']:8.1%}{row['alloc_retries']:8}"
+    text += format_cell(row["ratio"], 15, ".2f")
     if "loss" in row:
         text += f"{row['loss']:10.5f}{row['grad_norm']:10.5f}"
     if "waits" in row:
@@ -166,33 +201,39 @@ def time_line(row: Row) -> str:
     return text
 
 
-def compiled_graphs() -> int:
+def count_compiled_graphs() -> int:
     """Return how many graphs PyTorch has compiled so far."""
     from torch._dynamo.utils import counters
 
     return int(counters["stats"]["unique_graphs"])
 
 
-def choose_ways(bench: Bench, options: argparse.Namespace, rows: Rows) -> list[str]:
-    """Return the ways to compare, the baseline first; the official one only if it computes the same."""
-    ours = our_ways(options.attention, compiled=options.compile)
-    plain = ["dense", *(way for way in ours if way != "dense")] if options.time else ours  # memory has no baseline
+def choose_variants(bench: Bench, options: argparse.Namespace, rows: Rows) -> list[str]:
+    """Return the variants to compare, the baseline first; the official code only if its results are the same."""
+    ours = our_variants(options.attention, compiled=options.compile)
+    without_official = ours
+    if options.time:  # memory is compared without a baseline
+        without_official = ["dense", *(variant for variant in ours if variant != "dense")]
     print(f"ours: {trainable_report(bench.model)}")
     if not has_checkout(options):
         print(f"official: skipped, needs {options.official / PREDICTOR}, found no such file")
-        return plain
-    named = {"measured": "same loss and gradients", "dtype": str(bench.dtype).removeprefix("torch."), "way": OFFICIAL}
-    if rows.attempt(partial(is_official_the_same, bench, rows, named), **named):
+        return without_official
+    about = {
+        "measured": "same loss and gradients",
+        "dtype": str(bench.dtype).removeprefix("torch."),
+        "variant": OFFICIAL,
+    }
+    if rows.attempt(partial(matches_official, bench, rows, about), **about):
         return [OFFICIAL, *([OFFICIAL_FULL] if options.full else []), *ours]
-    bench.keep_only(plain[0])
-    bench.let_go_of_a_step()
-    return plain
+    bench.keep_only(without_official[0])
+    bench.clear_failed_step()
+    return without_official
 
 
-def is_official_the_same(bench: Bench, rows: Rows, named: Row) -> bool:
-    """Return whether the official predictor computes the same, and print the result."""
+def matches_official(bench: Bench, rows: Rows, about: Row) -> bool:
+    """Return whether the official predictor gives the same loss and gradients, and print the result."""
     difference = bench.compare()
-    rows.add({**named, "difference": difference})
+    rows.add({**about, "difference": difference})
     count = sum(parameter.numel() for parameter in bench.official.trained)
     print(f"official with plain PEFT LoRA on fused q, k, v: {count:,} parameters are trained")
     if difference is None:
@@ -238,7 +279,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--profile", action="store_true", help="count device synchronisations and compilations")
     add_options(parser)
     parser.add_argument("--memory-of", help=argparse.SUPPRESS)
-    options = settle(parser.parse_args(arguments), QUICK)
+    options = apply_defaults(parser.parse_args(arguments), QUICK)
     if options.encoder and not options.memory_of:
         options.source = ["pixels"]
     on_cpu = options.device == "cpu"
@@ -249,10 +290,10 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def _introduce(options: argparse.Namespace) -> None:
-    latents = f"{options.encoder_layers} of encoder where it is in the step"
-    print(introduction(options))
+    print(describe_machine(options))
     print(
-        f"{options.layers} layers of width {options.width}, {latents}, {options.image_size} px,"
+        f"{options.layers} layers of width {options.width}, encoder of {options.encoder_layers} layers (source pixels),"
+        f" {options.image_size} px,"
         f" rollout of {options.rollout_steps}, {options.repeats} repeats after {options.warm_up}"
         + (f"; memory: at most {options.cap_gb:g} GB" if options.cap_gb else "")
     )

@@ -13,10 +13,10 @@ from unittest import mock
 
 import torch
 from accelerate import Accelerator
-from memory import let_go
-from official_predictor import PREDICTOR, Official, difference
+from memory import release_memory
+from official_predictor import PREDICTOR, OfficialStep, compare_with_official
 from random_models import add_random_adapter, random_model
-from rows import problem_of
+from rows import describe_failure
 from torch import Tensor
 from torch.nn.functional import layer_norm
 
@@ -44,16 +44,16 @@ from vjepa2_ac.training.optim import make_optimizer
 from vjepa2_ac.training.step import Objective, Run, micro_step, training_step
 
 OFFICIAL = "official"
-OFFICIAL_FULL = "official_full"  # every weight of its predictor is trained
-COMPILED, GRAPH = "+compile", "+graph"  # at the end of a way of ours, in this order
+OFFICIAL_FULL = "official_full"  # full fine-tuning of the official predictor
+COMPILED, GRAPH = "+compile", "+graph"  # suffixes of this package's variants, in this order
 PRECISIONS = {"float32": "fp32", "bfloat16": "bf16"}
-_NEXT_TO_NOTHING = 1e-30  # as fast as any learning rate, and every step has the loss and the gradients of the first
-_PAST_WARM_UP = 1001  # a step at which the learning rate is what it mostly is
+_TINY_LEARNING_RATE = 1e-30  # keeps the weights, so that all steps have the loss and gradients of the first step
+_STEP_AFTER_WARM_UP = 1001  # number of a step after the warm-up of the learning rate
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a line is about."""
+    """The setting of a line: clip length, batch size, and what is computed in the step."""
 
     frames: int
     batch: int
@@ -62,35 +62,35 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Started:
-    """A way that has done its first steps, or what came in between."""
+class WarmUp:
+    """The result of a variant's first two steps."""
 
-    step: Callable[[], object] | None
-    first_s: float | None
-    problem: str | None
-    found: dict[str, float] = field(default_factory=dict)  # loss and norm of the gradients; none of an official way
-
-
-def our_ways(attention: Sequence[str], *, compiled: bool) -> list[str]:
-    """Return ways of ours: kinds of attention, each once more compiled, if that is asked for."""
-    return [*attention, *(way + COMPILED for way in attention if compiled)]
+    step: Callable[[], object] | None  # None: a step failed
+    first_s: float | None  # duration of the first step
+    problem: str | None  # why a step failed
+    metrics: dict[str, float] = field(default_factory=dict)  # loss and gradient norm; empty for the official code
 
 
-def take_way(model: WorldModel, way: str) -> None:
-    """Let a model train in one of our ways."""
-    model.set_attention(way.split("+", maxsplit=1)[0])  # type: ignore[arg-type]  # checked when it is used
-    model.set_compiled("with gradients" if COMPILED in way else "never")
+def our_variants(attention: Sequence[str], *, compiled: bool) -> list[str]:
+    """Return the variants of this package: kinds of attention, and with `compiled` the same with compiled blocks."""
+    return [*attention, *(variant + COMPILED for variant in attention if compiled)]
+
+
+def apply_variant(model: WorldModel, variant: str) -> None:
+    """Set the attention and the compilation of a variant of this package."""
+    model.set_attention(variant.split("+", maxsplit=1)[0])  # type: ignore[arg-type]  # checked when it is used
+    model.set_compiled("with gradients" if COMPILED in variant else "never")
 
 
 def has_checkout(options: argparse.Namespace) -> bool:
-    """Return whether the official code is where it is looked for."""
+    """Return whether the official code is at --official."""
     return bool((options.official / PREDICTOR).is_file())
 
 
 class Bench:
-    """Our model and the official one in one precision, with the same weights; neither is there until it is needed."""
+    """The models of this package and of the official code, in one precision and with equal weights."""
 
-    _kind_of_official = Official
+    _official_class = OfficialStep
 
     def __init__(self, options: argparse.Namespace, dtype: str) -> None:
         self.options, self.precision = options, PRECISIONS[dtype]
@@ -102,32 +102,30 @@ class Bench:
             ),
             predictor=PredictorSizes(width=options.width, heads=options.width // 64, depth=options.layers),
         )
-        self._weights: dict[str, Any] | None = None  # where the official code is to get them
+        self._weights: dict[str, Any] | None = None  # for the official code; None without a checkout
 
     @cached_property
     def model(self) -> WorldModel:
-        """Ours, in float32 until its first step."""
+        """The model of this package, in float32 until its first step."""
         return self._model().train()
 
     @cached_property
-    def official(self) -> Official:
-        """The official step; to be asked for before ours takes its own type."""
-        return self._official()
+    def official(self) -> OfficialStep:
+        """The official step; must be built before the first step of this package, which casts the weights."""
+        return self._build_official()
 
     @cached_property
-    def official_full(self) -> Official:
-        """The same, trained whole, as it is released; made when it is first timed, for it needs 5 GB."""
-        return self._official(whole=True)
+    def official_full(self) -> OfficialStep:
+        """The official step with full fine-tuning, as released. It needs 5 GB."""
+        return self._build_official(is_full=True)
 
     def compare(self) -> str | None:
-        """Return how the official predictor's loss and gradients differ from ours, on a short clip, in float32.
-
-        Its convolution, too: PyTorch rounds those to TF32 on CUDA unless told otherwise.
-        """
+        """Return how the loss and the gradients of the official code differ on a short clip in float32; None: not."""
+        # By default PyTorch rounds the inputs of convolutions on CUDA to TF32.
         with torch.backends.cudnn.flags(allow_tf32=False):
-            return self._compared()
+            return self._compare()
 
-    def _compared(self) -> str | None:
+    def _compare(self) -> str | None:
         setting = Setting(
             min(max(4, self.options.rollout_steps + 1), *self.options.frames), 1, False, "pixels" in self.options.source
         )
@@ -136,126 +134,127 @@ class Bench:
         if setting.encoder:
             pixels = pixels_to_input(self.frames(setting), self.options.image_size)
             gap = (self.model.encode(pixels) - self.official.encode(pixels.transpose(1, 2))).abs().max()
-            if not gap < 1e-3:  # of values of variance 1
+            if not gap < 1e-3:  # the latents have variance 1
                 return f"latents differ by {float(gap):.2g}"
-        return difference(objective, self.official, latents)
+        return compare_with_official(objective, self.official, latents)
 
     def frames(self, setting: Setting) -> Tensor:
         """Return the frames of a batch, on the device."""
         frames = self.batch(setting).frames
         if frames is None:
-            raise ValueError("a batch of latents")
+            raise ValueError("the batch has latents instead of frames")
         return frames.to(self.device)
 
-    def config(self, setting: Setting, *, whole: bool = False, graph: bool = False) -> Config:
-        """Return what a run of a setting is (`whole`: without an adapter); its data and base are never opened."""
+    def config(self, setting: Setting, *, is_full: bool = False, graph: bool = False) -> Config:
+        """Return the config of a run, with LoRA or full fine-tuning. Its data and base model are never opened."""
         options = self.options
         return Config(
             run_dir="benchmark",
             data=DataConfig(path="none", frames=setting.frames, source="rlds" if setting.encoder else "latents"),
-            adapter=AdapterConfig(kind="none" if whole else "lora"),
+            adapter=AdapterConfig(kind="none" if is_full else "lora"),
             model=ModelConfig(base="none", dtype="bfloat16" if self.precision == "bf16" else "float32"),
             training=TrainingConfig(
                 batch_size=setting.batch, accumulation=1, rollout_steps=options.rollout_steps,
-                learning_rate=_NEXT_TO_NOTHING, cuda_graph=graph,
+                learning_rate=_TINY_LEARNING_RATE, cuda_graph=graph,
                 device="cpu" if self.device.type == "cpu" else "cuda",
                 precision="bf16" if self.precision == "bf16" else "fp32", gradient_checkpointing=setting.checkpointing,
             ),
         )  # fmt: skip
 
-    def flops_per_clip(self, setting: Setting, way: str = "") -> int:
+    def flops_per_clip(self, setting: Setting, variant: str = "") -> int:
         """Return the model FLOPs of a clip."""
-        flops = clip_flops(self.config(setting, whole=way == OFFICIAL_FULL), self.sizes)
+        flops = clip_flops(self.config(setting, is_full=variant == OFFICIAL_FULL), self.sizes)
         return flops.total if setting.encoder else flops.predictor
 
     def estimated_gb(self, setting: Setting) -> float:
-        """Return what `doctor` says of the run's GPU memory, less what it allows for and PyTorch does not count."""
+        """Return the GPU memory that `doctor` estimates, without the allowance for memory outside of PyTorch."""
         config = self.config(setting)
         config = config.model_copy(update={"validation": config.validation.model_copy(update={"batch_size": 1})})
         estimate = estimate_memory(config, self.sizes)
         return (estimate.total(checkpointing=setting.checkpointing) - ALLOWANCE) / 1e9
 
-    def step(self, setting: Setting, way: str) -> Callable[[], object]:
-        """Return what does one optimizer step and waits for it: an official one, or ours with a kind of attention."""
+    def step(self, setting: Setting, variant: str) -> Callable[[], object]:
+        """Return a function that computes one optimizer step of a variant and waits for the device."""
         latents, pixels = self.latents(setting), None
-        if way in {OFFICIAL, OFFICIAL_FULL}:
+        if variant in {OFFICIAL, OFFICIAL_FULL}:
             if setting.encoder:
                 frames = self.frames(setting)
                 pixels = pixels_to_input(frames, self.options.image_size).transpose(1, 2).contiguous()
-            official = self.official if way == OFFICIAL else self.official_full
+            official = self.official if variant == OFFICIAL else self.official_full
             return partial(
                 official.step, latents, pixels, self.dtype, checkpointing=setting.checkpointing
-            )  # it waits for its loss, as it does in training
+            )  # waits for the loss, as in the official training
         for parameter in self.model.parameters():
             if not parameter.requires_grad:
                 parameter.data = parameter.data.to(self.dtype)
-        run, batches = self.run(setting, graph=way.endswith(GRAPH)), itertools.repeat(self.batch(setting))
-        return partial(self._our_step, run, batches, None if setting.encoder else latents, way)
+        run, batches = self.run(setting, graph=variant.endswith(GRAPH)), itertools.repeat(self.batch(setting))
+        return partial(self._our_step, run, batches, None if setting.encoder else latents, variant)
 
-    def _our_step(self, run: Run, batches: Any, latents: LatentBatch | None, way: str) -> dict[str, float]:
-        take_way(self.model, way)
+    def _our_step(self, run: Run, batches: Any, latents: LatentBatch | None, variant: str) -> dict[str, float]:
+        apply_variant(self.model, variant)
         self.model.set_gradient_checkpointing(run.config.training.gradient_checkpointing)
         if latents is None:
-            return training_step(run, batches, step=_PAST_WARM_UP)
-        with mock.patch("vjepa2_ac.training.step.encode", return_value=latents):  # they are there already
-            return training_step(run, batches, step=_PAST_WARM_UP)
+            return training_step(run, batches, step=_STEP_AFTER_WARM_UP)
+        with mock.patch("vjepa2_ac.training.step.encode", return_value=latents):  # as cached latents
+            return training_step(run, batches, step=_STEP_AFTER_WARM_UP)
 
-    def start(self, setting: Setting, way: str) -> Started:
-        """Do the first two steps of a way: what is compiled is compiled here, and what does not fit shows."""
+    def warm_up(self, setting: Setting, variant: str) -> WarmUp:
+        """Run the first two steps of a variant, which include compilation. A lack of memory is reported."""
         began = time.perf_counter()
         try:
-            step = self.step(setting, way)
+            step = self.step(setting, variant)
             step()
             first_s = time.perf_counter() - began
-            metrics = step()  # what is compiled for the second time
-            found = {name: metrics[name] for name in ("loss", "grad_norm")} if isinstance(metrics, dict) else {}
-            return Started(step, first_s, None, found)
+            all_metrics = step()  # some graphs are compiled again in the second step
+            names = ("loss", "grad_norm")
+            metrics = {name: all_metrics[name] for name in names} if isinstance(all_metrics, dict) else {}
+            return WarmUp(step, first_s, None, metrics)
         except Exception as error:
-            problem = problem_of(error)
-        self.let_go_of_a_step()
-        return Started(None, None, problem)
+            problem = describe_failure(error)
+        self.clear_failed_step()
+        return WarmUp(None, None, problem)
 
-    def let_go_of_a_step(self) -> None:
-        """Let go of what a step has left that did not end."""
-        there = vars(self)
-        modules = [there["model"]] if "model" in there else []
-        modules += [there[name].predictor for name in (OFFICIAL, OFFICIAL_FULL) if name in there]
+    def clear_failed_step(self) -> None:
+        """Release the gradients and the memory of a step that failed."""
+        attributes = vars(self)  # a cached property that was not used is missing
+        modules = [attributes["model"]] if "model" in attributes else []
+        modules += [attributes[name].predictor for name in (OFFICIAL, OFFICIAL_FULL) if name in attributes]
         for module in modules:
             module.zero_grad(set_to_none=True)
-        let_go(self.options.device)
+        release_memory(self.options.device)
 
-    def keep_only(self, way: str) -> None:
-        """Let go of what a way does not need, once its step is there."""
+    def keep_only(self, variant: str) -> None:
+        """Delete the models that a variant does not need; its step must have been created."""
         self._weights = None
-        kept = way if way in {OFFICIAL, OFFICIAL_FULL} else "model"
-        for name in {"model", OFFICIAL, OFFICIAL_FULL} - {kept}:
+        needed = variant if variant in {OFFICIAL, OFFICIAL_FULL} else "model"
+        for name in {"model", OFFICIAL, OFFICIAL_FULL} - {needed}:
             vars(self).pop(name, None)
 
     def _model(self) -> WorldModel:
         model = random_model(self.sizes, self.dtype, self.device)
-        if has_checkout(self.options):  # in half the memory; both keep the same
+        if has_checkout(self.options):  # both models have values that `dtype` can represent
             official = to_official(model)
-            self._weights = {part: _in_type(official[part], self.dtype) for part in ("encoder", "predictor")}
+            self._weights = {part: _cast_weights(official[part], self.dtype) for part in ("encoder", "predictor")}
         add_random_adapter(model)
         return model
 
-    def _drawn(self, shape: tuple[int, ...]) -> Tensor:
+    def _draw(self, shape: tuple[int, ...]) -> Tensor:
         return torch.randn(shape, generator=torch.Generator(self.device).manual_seed(0), device=self.device)
 
     def _accelerator(self, config: Config) -> Accelerator:
         return make_accelerator(config)
 
-    def _official(self, *, whole: bool = False) -> Official:
-        _ = self.model  # which gives the weights
+    def _build_official(self, *, is_full: bool = False) -> OfficialStep:
+        _ = self.model  # building it sets `_weights`
         assert self._weights is not None, "no checkout"
         config = self.config(Setting(max(self.options.frames), 1, checkpointing=False))
-        return self._kind_of_official(
-            self.options.official, self._weights, self.sizes, None if whole else config.adapter, config.training,
+        return self._official_class(
+            self.options.official, self._weights, self.sizes, None if is_full else config.adapter, config.training,
             frames=max(self.options.frames), encoder="pixels" in self.options.source, device=self.device,
         )  # fmt: skip
 
     def run(self, setting: Setting, *, graph: bool = False) -> Run:
-        """Return the run that `training_step` works on."""
+        """Return the run that `training_step` needs."""
         config = self.config(setting, graph=graph)
         return Run(
             config=config,
@@ -265,7 +264,7 @@ class Bench:
             micro_step=GraphedMicroStep() if graph else micro_step,
             optimizer=make_optimizer(self.model, config.training),
             scaler=torch.amp.GradScaler(self.device.type, enabled=False),
-            dataset=Dataset.__new__(Dataset),  # never opened: batches are given
+            dataset=Dataset.__new__(Dataset),  # never opened, because the batches are random
             state=RunState(step=0),
             micro_batches=1,
         )
@@ -274,27 +273,27 @@ class Bench:
         """Return random clips."""
         tokens = (self.sizes.image_size // self.sizes.patch_size) ** 2
         shape = (setting.batch, setting.frames, tokens, self.sizes.encoder.width)
-        drawn = layer_norm(self._drawn(shape), shape[-1:])
+        latents = layer_norm(self._draw(shape), shape[-1:])
         states, actions = (value.to(self.device) for value in _states_and_actions(setting))
-        return LatentBatch(drawn, states, actions, None, ("a",) * setting.batch, (0,) * setting.batch)
+        return LatentBatch(latents, states, actions, None, ("a",) * setting.batch, (0,) * setting.batch)
 
     def batch(self, setting: Setting) -> Batch:
-        """Return the same clips as the loader gives them; without pixels where nobody looks at them."""
+        """Return the same clips as a batch of the loader; for cached latents with images of one pixel."""
         side = self.options.image_size if setting.encoder else 1
         shape = (setting.batch, setting.frames, side, side, 3)
         frames = torch.randint(256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
         states, actions = _states_and_actions(setting)
         batch = Batch(frames, states, actions, None, ("a",) * setting.batch, (0,) * setting.batch)
-        # Its way to the device is part of the step. A device that is but imagined pins nothing.
+        # The copy to the device is part of the step. The fake GPU does not support pinned memory.
         return batch.pin_memory() if self.device.type == "cuda" and torch.cuda.is_available() else batch
 
 
 def _states_and_actions(setting: Setting) -> tuple[Tensor, Tensor]:
-    """Return poses of random clips and the steps between them: [batch, time, 7] and [batch, time-1, 7]."""
+    """Return random poses and their differences: [batch, time, 7] and [batch, time-1, 7]."""
     generator = torch.Generator().manual_seed(1)
     poses = torch.randn(setting.batch, setting.frames, 7, generator=generator) * 0.3
     return poses, poses[:, 1:] - poses[:, :-1]
 
 
-def _in_type(weights: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
+def _cast_weights(weights: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
     return {name: value.to(dtype) for name, value in weights.items()}

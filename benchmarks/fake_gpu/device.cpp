@@ -1,7 +1,7 @@
-// A CUDA device that is not there: enough of one for fake tensors, which have shapes and types but no numbers.
+// A fake CUDA device for fake tensors, which have shapes and types but no values.
 //
-// Fake tensors ask a device guard which device is current, autograd asks it for streams, and torch.accelerator asks the
-// hooks whether there is a GPU. Nothing here computes, waits or allocates. To be loaded before anything asks.
+// Fake tensors get the current device from a device guard, autograd gets streams from it, and torch.accelerator gets the
+// presence of a GPU from the hooks. This code does not compute, wait or allocate. Load it before PyTorch is imported.
 
 #include <ATen/detail/CUDAHooksInterface.h>
 #include <c10/core/impl/DeviceGuardImplInterface.h>
@@ -48,6 +48,6 @@ C10_REGISTER_GUARD_IMPL(CUDA, Guard)
 } // namespace
 
 namespace at {
-using CUDAHooks = ::Hooks; // the name by which PyTorch looks for them
+using CUDAHooks = ::Hooks; // the name that PyTorch uses
 REGISTER_CUDA_HOOKS(CUDAHooks)
 } // namespace at

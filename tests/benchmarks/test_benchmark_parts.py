@@ -1,4 +1,4 @@
-"""Rows of benchmarks outlive them, and memory is measured alone."""
+"""Rows of benchmarks are written at once, and peak memory is measured alone."""
 
 import json
 import math
@@ -18,12 +18,12 @@ Load = Callable[[str], Any]
 def test_each_row_is_written_at_once_and_unfinished_results_are_marked(load: Load, tmp_path: Path) -> None:
     file = tmp_path / "results" / "rows.json"
     table = load("rows").Rows(file, torch="2")
-    table.add({"way": "a", "ms": math.nan})
-    assert json.loads(file.read_text()) == {"torch": "2", "rows": [{"way": "a", "ms": None}]}
-    table.so_far({"way": "b"})
-    assert json.loads(file.read_text())["rows"][1:] == [{"way": "b", "finished": False}]
-    table.add({"way": "b"})
-    assert json.loads(file.read_text())["rows"][1:] == [{"way": "b"}]
+    table.add({"variant": "a", "ms": math.nan})
+    assert json.loads(file.read_text()) == {"torch": "2", "rows": [{"variant": "a", "ms": None}]}
+    table.write_unfinished({"variant": "b"})
+    assert json.loads(file.read_text())["rows"][1:] == [{"variant": "b", "finished": False}]
+    table.add({"variant": "b"})
+    assert json.loads(file.read_text())["rows"][1:] == [{"variant": "b"}]
     assert list(file.parent.iterdir()) == [file]
 
 
@@ -34,16 +34,16 @@ def test_failed_part_gives_a_row_and_an_error_status_but_out_of_memory_is_a_resu
         raise torch.OutOfMemoryError("CUDA out of memory")
 
     table = load("rows").Rows(None)
-    assert table.attempt(lambda: 3, way="a") == 3
-    assert table.attempt(runs_out, way="b") is None
+    assert table.attempt(lambda: 3, variant="a") == 3
+    assert table.attempt(runs_out, variant="b") is None
     table.finish()
-    assert table.attempt([].pop, way="c") is None
+    assert table.attempt([].pop, variant="c") is None
     with pytest.raises(SystemExit, match="1 of 2 rows failed") as end:
         table.finish()
     assert end.value.code not in {None, 0}
-    said = capsys.readouterr()
-    assert said.out.splitlines() == ["b, out of memory", "c, failed: IndexError: pop from empty list"]
-    assert "Traceback" in said.err
+    output = capsys.readouterr()
+    assert output.out.splitlines() == ["b, out of memory", "c, failed: IndexError: pop from empty list"]
+    assert "Traceback" in output.err
 
 
 # ---- memory ----
@@ -53,11 +53,11 @@ def test_failed_part_gives_a_row_and_an_error_status_but_out_of_memory_is_a_resu
     ("program", "peak", "problem"),
     [
         ("print('hello'); print(1.5)", 1.5, None),
-        ("import sys; sys.exit('no room')", None, "RuntimeError: a process of its own ended with 1: no room"),
+        ("import sys; sys.exit('no room')", None, "RuntimeError: the benchmark process exited with 1: no room"),
         (
             "import os; os.kill(os.getpid(), 9)",
             None,
-            "RuntimeError: a process of its own ended with -9: it says nothing",
+            "RuntimeError: the benchmark process exited with -9: no error output",
         ),
         ("print('hello')", None, "JSONDecodeError: Expecting value: line 1 column 1 (char 0)"),
     ],
@@ -65,5 +65,5 @@ def test_failed_part_gives_a_row_and_an_error_status_but_out_of_memory_is_a_resu
 def test_cpu_peak_memory_is_measured_in_a_separate_process_even_if_it_fails(
     load: Load, program: str, peak: float | None, problem: str | None
 ) -> None:
-    found = load("memory").peak_alone([].pop, ["-c", program], "cpu")
-    assert found == {"peak_gb": peak, "problem": problem and f"failed: {problem}"}
+    fields = load("memory").measure_peak_alone([].pop, ["-c", program], "cpu")
+    assert fields == {"peak_gb": peak, "problem": problem and f"failed: {problem}"}

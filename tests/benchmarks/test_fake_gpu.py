@@ -1,4 +1,4 @@
-"""The fake GPU counts memory and waits; `doctor` agrees with it."""
+"""The fake GPU counts memory and waits, and the estimate of `doctor` agrees with the count."""
 
 import json
 import os
@@ -22,7 +22,7 @@ MEBIBYTE = 2**20
 
 @pytest.fixture(scope="module")
 def counted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """All that is checked below, from one process: PyTorch must not have been imported before it sees the GPU."""
+    """Rows and counts from one process; the fake GPU must be loaded before PyTorch is imported."""
     if not any(map(shutil.which, (os.environ.get("CXX", "g++").split()[0], "c++"))):
         pytest.skip("no C++ compiler")
     out = tmp_path_factory.mktemp("fake_gpu")
@@ -32,20 +32,20 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     }
     arguments = [[*words.split(), "--json", str(out / name)] for name, words in runs.items()]
     command = [sys.executable, str(ROOT / "tests/support/fake_gpu_facts.py"), str(FOLDER), json.dumps(arguments)]
-    done = subprocess.run(
+    process = subprocess.run(
         command, check=False, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
     )
-    assert not done.returncode, done.stderr[-4000:]
+    assert not process.returncode, process.stderr[-4000:]
     rows = {name: json.loads((out / name).read_text()) for name in runs}
-    return {"rows": rows, "facts": json.loads(done.stdout.splitlines()[-1])}
+    return {"rows": rows, "counts": json.loads(process.stdout.splitlines()[-1])}
 
 
 def test_bytes_and_synchronizations_of_known_tensors_are_exact(counted: dict[str, Any]) -> None:
-    assert counted["facts"] == {
-        "live": MEBIBYTE + 1024, "peak": MEBIBYTE + 1024, "live, of a view": 1024,
+    assert counted["counts"] == {
+        "live": MEBIBYTE + 1024, "peak": MEBIBYTE + 1024, "live, with a view": 1024,
         "kept for the backward pass": 2 * MEBIBYTE + 512,  # weights, output of exp, and the loss
-        "waits for numbers": 2,  # all numbers of one tensor are one wait
-        "waits that are none": 0, "waits for copies": 3,
+        "waits for numbers": 2,  # reading all numbers of a tensor is one wait
+        "waits for non-blocking copies": 0, "waits for copies": 3,
     }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Programs of `benchmarks`: they run to their end, their table is complete, and commands for a GPU can be given."""
+"""The programs in `benchmarks` run to completion, their tables are complete, and the commands for a GPU are valid."""
 
 import re
 import shlex
@@ -17,7 +17,7 @@ from vjepa2_ac.training.cost import count_parameters
 
 Load = Callable[[str], Any]
 SECTION = (ROOT / "docs/IMPLEMENTATION_NOTES.md").read_text().split("\n## GPU measurements\n")[1].split("\n## ")[0]
-ENCODERS = [one for one in PUBLISHED if one.model_kind == "encoder"]
+ENCODERS = [model for model in PUBLISHED if model.model_kind == "encoder"]
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_benchmark_program_runs_to_completion(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     module = load(name)
-    if name == "index":  # it changes these itself, for a process of its own
+    if name == "index":  # the program changes these values; they are restored after the test
         monkeypatch.setattr(module.rlds_index, "_IN_FLIGHT", module.rlds_index._IN_FLIGHT)
         monkeypatch.setenv("STORAGE_EMULATOR_HOST", "")
     if name == "loader":
@@ -53,7 +53,7 @@ def test_benchmark_program_runs_to_completion(
     assert printed in capfd.readouterr().out
 
 
-def test_the_action_score_is_printed(make_config, tmp_path: Path, load: Load, capsys) -> None:
+def test_action_score_is_printed(make_config, tmp_path: Path, load: Load, capsys) -> None:
     config = make_config(data__frames=4, data__test_share=0.4)
     (tmp_path / "data.yaml").write_text(config_as_yaml(config))
     words = [str(config.model.base), str(tmp_path / "data.yaml"), "--clips", "2", "--samples", "12"]
@@ -61,32 +61,32 @@ def test_the_action_score_is_printed(make_config, tmp_path: Path, load: Load, ca
     assert capsys.readouterr().out.startswith("plans: Action Score ")
 
 
-def test_every_encoder_that_can_be_downloaded_has_a_row(load: Load) -> None:
-    rows = load("encoders").published()
-    assert {name for _, names in rows.values() for name in names} == {one.name for one in ENCODERS}
-    written = (ROOT / "benchmarks/results/encoders.md").read_text()
+def test_every_downloadable_encoder_has_a_row(load: Load) -> None:
+    rows = load("encoders").published_encoders()
+    assert {name for _, names in rows.values() for name in names} == {model.name for model in ENCODERS}
+    table = (ROOT / "benchmarks/results/encoders.md").read_text()
     assert "](../benchmarks/results/encoders.md)" in (ROOT / "docs/encoders_reference.md").read_text()
-    assert all(f"\n| {name} | {', '.join(names)} |" in written for name, (_, names) in rows.items())
+    assert all(f"\n| {name} | {', '.join(names)} |" in table for name, (_, names) in rows.items())
 
 
-@pytest.mark.parametrize("published", ENCODERS, ids=lambda one: one.name)
-def test_parameters_of_a_published_encoder_are_those_of_its_name(published: Any) -> None:
+@pytest.mark.parametrize("published", ENCODERS, ids=lambda model: model.name)
+def test_parameter_count_of_encoder_equals_published_number(published: Any) -> None:
     config = load_config(ROOT / "configs/scratch_vitb.yaml", [f"model.encoder.path=nowhere/{published.name}.pt"])
-    found = count_parameters(config, base_sizes(config.model)).encoder
-    assert found == pytest.approx(published.encoder.parameters, rel=0.02)
+    count = count_parameters(config, base_sizes(config.model)).encoder
+    assert count == pytest.approx(published.encoder.parameters, rel=0.02)
 
 
-def test_every_part_is_a_command_of_its_benchmark(load: Load) -> None:
+def test_arguments_of_every_part_are_valid(load: Load) -> None:
     on_gpu = load("on_gpu")
     assert len({part.name for part in on_gpu.PARTS}) == len(on_gpu.PARTS)
     for part in on_gpu.PARTS:
         if parse := getattr(load(part.benchmark), "parse", None):
-            named = getattr(parse(part.arguments.split()), "attention", [])
-            assert {way.split("+")[0] for way in named} <= set(get_args(AttentionKind))
+            variants = getattr(parse(part.arguments.split()), "attention", [])
+            assert {variant.split("+")[0] for variant in variants} <= set(get_args(AttentionKind))
 
 
-def test_commands_of_the_notes_are_valid(load: Load) -> None:
+def test_commands_in_the_implementation_notes_are_valid(load: Load) -> None:
     commands = re.findall(r"python (benchmarks/\w+\.py[^`]*)`", SECTION)
     assert len(commands) > 1
-    for script, *given in map(shlex.split, commands):
-        load(Path(script).stem).parse(given)
+    for script, *arguments in map(shlex.split, commands):
+        load(Path(script).stem).parse(arguments)
