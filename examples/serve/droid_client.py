@@ -20,10 +20,10 @@ import numpy as np
 def drive(env: Any, policy: Any, camera: str, goal: str, steps: int = 30) -> None:
     """Move the arm to a goal that is stored on the server, one model step at a time."""
     for step in range(steps):
-        answer = policy.infer(make_request(env.get_observation(), camera) | {"prompt": goal, "reset": step == 0})
-        target = np.asarray(answer["actions"][-1])  # x, y, z, roll, pitch, yaw, closedness, as in DROID
-        print(f"{step}: {answer['why']}, energy {answer['energy']['now']}, to {target[:3].round(3)}")
-        if answer["done"]:
+        reply = policy.infer(make_request(env.get_observation(), camera) | {"prompt": goal, "reset": step == 0})
+        target = np.asarray(reply["actions"][-1])  # x, y, z, roll, pitch, yaw, closedness, as in DROID
+        print(f"{step}: {reply['why']}, energy {reply['energy']['now']}, to {target[:3].round(3)}")
+        if reply["done"]:
             break
         env.update_robot(target, action_space="cartesian_position", gripper_action_space="position", blocking=True)
 

@@ -26,10 +26,10 @@ def drive(robot: Any, gripper: Any, policy: Any, camera: Callable[[], np.ndarray
 
     for step in range(steps):
         tool = robot.state.F_T_EE  # the server plans for the flange, franky moves the tool
-        answer = policy.infer(observe(camera(), robot.state.O_T_EE * tool.inverse, gripper) | goal_request(goal, step))
-        x, y, z, *angles, closedness = answer["actions"][-1]  # the target, within the server's limits and workspace
-        print(f"{step}: {answer['why']}, energy {answer['energy']['now']}, to {x:.3f} {y:.3f} {z:.3f}")
-        if answer["done"]:
+        reply = policy.infer(observe(camera(), robot.state.O_T_EE * tool.inverse, gripper) | goal_request(goal, step))
+        x, y, z, *angles, closedness = reply["actions"][-1]  # the target, within the server's limits and workspace
+        print(f"{step}: {reply['why']}, energy {reply['energy']['now']}, to {x:.3f} {y:.3f} {z:.3f}")
+        if reply["done"]:
             break
         flange = Affine([x, y, z], Rotation.from_euler("xyz", angles).as_quat())
         robot.move(CartesianMotion(flange * tool))  # returns when the arm has reached the pose

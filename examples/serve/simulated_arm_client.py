@@ -40,9 +40,9 @@ class ServedPlanner:
     def act(self, observation: Observation) -> np.ndarray:
         """Return the first action of the server's plan."""
         request = {"observation/image": observation.image, "observation/state": observation.state, **self.goal}
-        answer = self.client.infer(request)
-        self.goal, self.why = {}, answer["why"]
-        return np.asarray(answer["actions"][0])
+        reply = self.client.infer(request)
+        self.goal, self.why = {}, reply["why"]
+        return np.asarray(reply["actions"][0])
 
 
 def main(url: str, film: str, episodes: str = "4", seed: str = "3") -> None:

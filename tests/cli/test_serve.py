@@ -1,6 +1,7 @@
 """The command `serve`: a robot connects to the process, and invalid options raise before the server listens."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,46 +20,46 @@ KEY = "correct-horse-battery-staple"
 
 @pytest.fixture(scope="module")
 def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a model and pictures of goals."""
-    here = tmp_path_factory.mktemp("workshop")
-    tiny_model().save_pretrained(here / "model")
-    (here / "goals").mkdir()
-    Image.fromarray(image(50)).save(here / "goals/cup.png")
-    (here / "key").write_text(KEY)
-    (here / "key").chmod(0o600)
-    return here
+    """Return a folder with a model, goal images and a key."""
+    folder = tmp_path_factory.mktemp("workshop")
+    tiny_model().save_pretrained(folder / "model")
+    (folder / "goals").mkdir()
+    Image.fromarray(image(50)).save(folder / "goals/cup.png")
+    (folder / "key").write_text(KEY)
+    (folder / "key").chmod(0o600)
+    return folder
 
 
-def test_serve_answers_a_robot_and_records_every_decision(workshop: Path, tmp_path: Path) -> None:
+def test_serve_replies_to_a_robot_and_records_every_decision(workshop: Path, tmp_path: Path) -> None:
     record = tmp_path / "record"
     arguments = [str(workshop / "model"), "--goals", str(workshop / "goals"), "--key-file", str(workshop / "key")]
     process, url = started(*arguments, "--record", str(record), *QUICK)
     with pytest.raises(UnreachableError, match="401"):
         PlanningClient(url)
-    answers = []
+    replies = []
     with PlanningClient(url, KEY) as client:
         assert client.metadata["goals"] == ["cup"]
         assert client.metadata["limits"]["workspace"] is None
         assert str(workshop) not in json.dumps({**client.metadata})
         for step in range(3):
             message = {"observation/image": image(step), "observation/state": STATE + 0.01 * step, "prompt": "cup"}
-            answers.append(client.infer(message))
+            replies.append(client.infer(message))
     assert "robot disconnected" in ended(process)
     lines = [json.loads(line) for line in (record / "decisions.jsonl").read_text().splitlines()]
-    assert [line["answer"]["actions"] for line in lines] == [answer["actions"].tolist() for answer in answers]
+    assert [line["answer"]["actions"] for line in lines] == [reply["actions"].tolist() for reply in replies]
 
 
-def test_dry_run_with_poses_answers_roboarena_messages(workshop: Path) -> None:
+def test_dry_run_with_poses_replies_to_roboarena_messages(workshop: Path) -> None:
     arguments = ["--dry-run", "--actions", "pose", *QUICK, "data.stride=5"]
     process, url = started(str(workshop / "model"), *arguments)
     with PlanningClient(url) as client:
         assert client.metadata["action_space"] == "cartesian_position"
-        found = client.infer({
+        reply = client.infer({
             "endpoint": "infer", "session_id": "one", "observation/exterior_image_0_left": image(0),
             "observation/cartesian_position": STATE[:6], "observation/gripper_position": STATE[6:],
             "goal/image": image(1), "prompt": "put it there",
         })  # fmt: skip
-        np.testing.assert_allclose(found["actions"], np.tile(STATE, (5, 1)), atol=1e-9)
+        np.testing.assert_allclose(reply["actions"], np.tile(STATE, (5, 1)), atol=1e-9)
         assert client.infer({"endpoint": "reset", "session_id": "two"}) == {"status": "reset"}
     assert "dry run: every action is zero" in ended(process)
 
@@ -86,3 +87,13 @@ def test_model_that_needs_extrinsics_raises(workshop: Path, capsys) -> None:
     tiny_model(extrinsics=True).save_pretrained(workshop / "camera")
     assert main(["serve", str(workshop / "camera"), "--port", "0"]) == 2
     assert "predictor.use_extrinsics" in capsys.readouterr().err
+
+
+def test_folder_without_a_model_raises_before_loading(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "vjepa2_ac.serving.server", None)  # an import of the server would raise
+    assert main(["serve", str(tmp_path)]) == 2
+    assert "config.json: cannot be read: No such file or directory. Expected a folder written by" in (
+        capsys.readouterr().err
+    )

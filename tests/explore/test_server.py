@@ -1,4 +1,4 @@
-"""Access to the page and its socket; the newest request of a page is answered."""
+"""Access to the page and its socket; the newest request of a page gets a reply."""
 
 import http.client
 import json
@@ -55,21 +55,21 @@ def test_unknown_host_name_gets_no_page(recorded: Views) -> None:
             socket(url, "http://rebound.example", Host="rebound.example")
 
 
-def test_newest_request_is_answered_and_cancels_a_search(recorded: Views) -> None:
+def test_newest_request_gets_a_reply_and_cancels_a_search(recorded: Views) -> None:
     goal = {"episode": 0, "step": 6}
     with serving(recorded) as url, socket(url) as page:
         page.recv()
         page.send(json.dumps({"seq": 1, "kind": "plan", "goal": goal, "model": "base", "steps": 8}))
         for seq in range(2, 30):
             page.send(json.dumps({"seq": seq, "kind": "predict", "goal": goal}))
-        answers = []
-        while not answers or answers[-1]["seq"] != 29:
-            answers.append(header(page.recv()))
-        predicted = [answer["seq"] for answer in answers if answer["kind"] == "predict"]
+        replies = []
+        while not replies or replies[-1]["seq"] != 29:
+            replies.append(header(page.recv()))
+        predicted = [reply["seq"] for reply in replies if reply["kind"] == "predict"]
         assert predicted == sorted(predicted)
 
 
-def test_invalid_request_gets_an_error_and_the_next_one_is_answered(recorded: Views) -> None:
+def test_invalid_request_gets_an_error_and_the_next_one_gets_a_reply(recorded: Views) -> None:
     with serving(recorded) as url, socket(url) as page:
         page.recv()
         for invalid in ("{}", b"\x00", "[" * 1000, json.dumps({"seq": 1, "kind": "predict", "episode": 999})):
@@ -79,10 +79,10 @@ def test_invalid_request_gets_an_error_and_the_next_one_is_answered(recorded: Vi
         assert header(page.recv())["seq"] == 2
 
 
-def test_internal_error_is_logged_and_the_next_request_is_answered(
+def test_internal_error_is_logged_and_the_next_request_gets_a_reply(
     recorded: Views, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(Views, "_answer_episode", lambda *_: 1 / 0)
+    monkeypatch.setattr(Views, "_make_episode_reply", lambda *_: 1 / 0)
     with serving(recorded) as url, socket(url) as page:
         page.recv()
         page.send(json.dumps({"seq": 1, "kind": "episode"}))

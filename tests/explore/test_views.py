@@ -30,8 +30,8 @@ def parse_message(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]
     return header, images
 
 
-def get_answer(views: Views, **values: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    return parse_message(views.answer(PageRequest(seq=7, **values), no_progress, lambda: False))
+def get_reply(views: Views, **values: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    return parse_message(views.reply_to(PageRequest(seq=7, **values), no_progress, lambda: False))
 
 
 def test_hello_lists_models_episodes_and_moves(live: Views) -> None:
@@ -47,15 +47,15 @@ def test_hello_lists_models_episodes_and_moves(live: Views) -> None:
 
 
 def test_image_strip_has_the_frames_of_its_steps(recorded: Views) -> None:
-    content, images = get_answer(recorded, kind="episode", episode=1)
+    content, images = get_reply(recorded, kind="episode", episode=1)
     assert [f"frame-{number}" for number in range(len(content["steps"]))] == list(images)
     for number, step in enumerate(content["steps"]):
-        off = np.abs(images[f"frame-{number}"].astype(int) - recorded.explorer.get_observation(1, step).pixels)
-        assert off.mean() < 3  # JPEG
+        error = np.abs(images[f"frame-{number}"].astype(int) - recorded.explorer.get_observation(1, step).pixels)
+        assert error.mean() < 3  # images are JPEG-compressed
 
 
 def test_prediction_has_images_and_metrics_of_all_models(live: Views) -> None:
-    content, images = get_answer(live, kind="predict", start=4, actions=[UP, UP], goal=GOAL)
+    content, images = get_reply(live, kind="predict", start=4, actions=[UP, UP], goal=GOAL)
     assert {"start", "truth", "goal", "predicted-base", "predicted-adapter", "error-base", "error-adapter"} == set(
         images
     )
@@ -68,11 +68,11 @@ def test_prediction_has_images_and_metrics_of_all_models(live: Views) -> None:
 
 
 def test_ground_truth_without_simulator_exists_only_for_recorded_actions(recorded: Views) -> None:
-    start, _ = get_answer(recorded, kind="predict")
-    recorded_content, images = get_answer(recorded, kind="predict", actions=[start["next_recorded"]])
+    start, _ = get_reply(recorded, kind="predict")
+    recorded_content, images = get_reply(recorded, kind="predict", actions=[start["next_recorded"]])
     assert recorded_content["truth"] == "recorded"
     assert "error-adapter" in images
-    other, images = get_answer(recorded, kind="predict", actions=[UP])
+    other, images = get_reply(recorded, kind="predict", actions=[UP])
     assert other["truth"] is None
     assert other["persistence_error"] is None
     assert "truth" not in images
@@ -80,7 +80,7 @@ def test_ground_truth_without_simulator_exists_only_for_recorded_actions(recorde
 
 
 def test_energy_map_has_the_energy_of_each_action(recorded: Views) -> None:
-    content, _ = get_answer(recorded, kind="energy", actions=[UP], goal=GOAL, model="adapter", action=ZERO_ACTION)
+    content, _ = get_reply(recorded, kind="energy", actions=[UP], goal=GOAL, model="adapter", action=ZERO_ACTION)
     explorer, energy_map = recorded.explorer, content["maps"][0]
     position = RolloutPosition(0, 0, (tuple(UP),))
     state = torch.tensor(explorer.integrate_states(position)[-1], dtype=torch.float32)
@@ -96,20 +96,20 @@ def test_energy_map_has_the_energy_of_each_action(recorded: Views) -> None:
 
 
 def test_plan_is_within_the_limits_and_shows_each_iteration(recorded: Views) -> None:
-    content, images = get_answer(recorded, kind="plan", goal=GOAL, model="base", steps=3)
+    content, images = get_reply(recorded, kind="plan", goal=GOAL, model="base", steps=3)
     assert np.abs(np.array(content["actions"])[:, :3]).max() <= recorded.search.config.limits.xyz_m[0]
     assert len(content["actions"]) == 3
     assert list(images) == [f"best-{number}" for number in range(len(content["iterations"]))]
     assert content["energy_plan"] == pytest.approx(
         min(iteration["lowest"] for iteration in content["iterations"]), rel=0.2
     )
-    assert content == get_answer(recorded, kind="plan", goal=GOAL, model="base", steps=3)[0]
+    assert content == get_reply(recorded, kind="plan", goal=GOAL, model="base", steps=3)[0]
 
 
 def test_cancelled_search_raises(recorded: Views) -> None:
     for kind in ("plan", "energy"):
         with pytest.raises(SearchCancelledError):
-            recorded.answer(PageRequest(1, kind, goal=GOAL, model="base"), no_progress, lambda: True)  # type: ignore[arg-type]
+            recorded.reply_to(PageRequest(1, kind, goal=GOAL, model="base"), no_progress, lambda: True)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -130,9 +130,9 @@ def test_invalid_request_raises(text: str) -> None:
 @pytest.mark.parametrize("goal", [GoalFrame(50, 0), GoalFrame(0, 5000), None])
 def test_search_with_invalid_goal_or_model_raises(recorded: Views, goal: GoalFrame | None) -> None:
     with pytest.raises(InputError):
-        get_answer(recorded, kind="plan", goal=goal, model="base")
+        get_reply(recorded, kind="plan", goal=goal, model="base")
     with pytest.raises(InputError):
-        get_answer(recorded, kind="plan", goal=GOAL, model="unknown")
+        get_reply(recorded, kind="plan", goal=GOAL, model="unknown")
 
 
 def test_cancelled_simulation_stops_before_the_next_action(live: Views) -> None:
@@ -144,9 +144,9 @@ def test_cancelled_simulation_stops_before_the_next_action(live: Views) -> None:
         return len(calls) == 3
 
     with pytest.raises(SearchCancelledError):
-        live.answer(request, no_progress, cancelled)
+        live.reply_to(request, no_progress, cancelled)
     assert len(calls) == 3
-    again, images = parse_message(live.answer(request, no_progress, lambda: False))
-    other, expected = get_answer(live, kind="predict", start=2, actions=actions)
+    again, images = parse_message(live.reply_to(request, no_progress, lambda: False))
+    other, expected = get_reply(live, kind="predict", start=2, actions=actions)
     assert again["truth_state"] == other["truth_state"]
     np.testing.assert_array_equal(images["truth"], expected["truth"])

@@ -19,13 +19,13 @@ from stable_worldmodel.protocols import Costable  # noqa: E402
 from stable_worldmodel.solver.cem import CEMSolver  # noqa: E402
 from stable_worldmodel_cost import WorldModelCost  # noqa: E402
 
-from served import controller  # noqa: E402
+from served import make_controller  # noqa: E402
 
 folder = Path(sys.argv[1])
 asked = {name for name in vars(Costable) if not name.startswith("_")}
 assert asked, "a protocol with methods"
 given = dict(np.load(folder / "given.npz"))
-cost, chunks = WorldModelCost(controller()), torch.from_numpy(given["chunks"]).float()
+cost, chunks = WorldModelCost(make_controller()), torch.from_numpy(given["chunks"]).float()
 info = {"pixels": given["image"], "goal": given["goal"], "state": given["state"]}
 both = {name: np.stack([value, value]) for name, value in info.items()}
 seen = {name: np.repeat(value[:, None], 5, axis=1) for name, value in both.items()}  # as its solvers give it

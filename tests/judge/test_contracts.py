@@ -10,7 +10,7 @@ import numpy as np
 
 from installing import install
 from paths import ROOT
-from served import STATE, controller, image
+from served import STATE, image, make_controller
 
 HERE = Path(__file__).parent
 EXAMPLES = ROOT / "examples/judge"
@@ -32,7 +32,7 @@ def test_stable_worldmodel_solver_plans_with_this_model(tmp_path: Path) -> None:
     install(
         sys.executable, "--target", str(tmp_path / "site"), "--no-deps", "gymnasium", "loguru", "farama-notifications"
     )
-    own = controller()
+    own = make_controller()
     own.reset(image(100))
     chunks = np.random.default_rng(0).normal(0, 0.02, (5, 2, 7))
     np.savez(tmp_path / "given.npz", image=image(0), goal=image(100), state=STATE, chunks=chunks)

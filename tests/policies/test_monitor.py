@@ -172,7 +172,7 @@ def test_server_reports_an_alarm_in_its_reply_and_counts_it(tmp_path: Path) -> N
     answers = []
     for seed in range(2):
         asked = {"observation/image": image(seed), "observation/state": STATE, "goal/image": image(100)}
-        answers.append(unpack(session.answer(pack(asked))))
+        answers.append(unpack(session.reply_to(pack(asked))))
     assert "surprise" not in answers[0]
     assert answers[1]["surprise"]["is_alarm"]
     assert any("differs from the predicted frame" in note for note in answers[1]["notes"])

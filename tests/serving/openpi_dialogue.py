@@ -31,8 +31,8 @@ def dialogue(policy):
     again = policy.infer(
         {"observation/image": make_image(0), "observation/state": STATE, "goal/image": make_image(100), "reset": True}
     )
-    results["actions"] = [one["actions"].tolist() for one in (first, second, third, again)]
-    results["why"] = [one["why"] for one in (first, second, third, again)]
+    results["actions"] = [reply["actions"].tolist() for reply in (first, second, third, again)]
+    results["why"] = [reply["why"] for reply in (first, second, third, again)]
     broker = action_chunk_broker.ActionChunkBroker(policy, action_horizon=2)
     request = {"observation/image": make_image(3), "observation/state": STATE, "prompt": "cup"}
     results["one_by_one"] = [broker.infer(request)["actions"].tolist() for _ in range(2)]

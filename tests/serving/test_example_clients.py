@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from paths import ROOT
-from served import controller, image
+from served import image, make_controller
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.session import Session, SessionOptions
@@ -31,19 +31,19 @@ class Policy:
     def __init__(self, **options: Any) -> None:
         limits = LimitsConfig(workspace=BOX, xyz=(0.03, 0.03, 0.03), rotation=0.1, gripper_mode="free")
         self.session = Session(
-            controller(limits=limits), {"cup": (SubGoal(image(50), "cup"),)}, SessionOptions("pose", **options)
+            make_controller(limits=limits), {"cup": (SubGoal(image(50), "cup"),)}, SessionOptions("pose", **options)
         )
-        self.answers: list[dict] = []
+        self.replies: list[dict] = []
         self.max_replies = 100  # number of replies before the connection is lost
 
     def infer(self, obs: dict) -> dict:
-        if len(self.answers) == self.max_replies:
+        if len(self.replies) == self.max_replies:
             raise ConnectionError
-        answer = self.session.answer(pack(obs))
-        if isinstance(answer, str):
-            raise RuntimeError(f"Error in inference server:\n{answer}")  # noqa: TRY004 - as in openpi
-        self.answers.append(unpack(answer))
-        return self.answers[-1]
+        reply = self.session.reply_to(pack(obs))
+        if isinstance(reply, str):
+            raise RuntimeError(f"Error in inference server:\n{reply}")  # noqa: TRY004 - as in openpi
+        self.replies.append(unpack(reply))
+        return self.replies[-1]
 
 
 class Gripper:
@@ -172,11 +172,11 @@ def drive(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Dr
 def test_example_client_sends_the_measured_state_and_moves_to_the_targets(drive: Drive) -> None:
     policy = Policy()
     positions, gripper = drive(policy)
-    assert len(positions) == len(policy.answers) == 4
-    targets = np.array([answer["actions"][-1] for answer in policy.answers])
+    assert len(positions) == len(policy.replies) == 4
+    targets = np.array([reply["actions"][-1] for reply in policy.replies])
     np.testing.assert_allclose(positions, targets[:, :3], atol=1e-7)
     assert (abs(np.diff([[0.45, 0.0, 0.3], *positions], axis=0)) <= 0.03 + 1e-6).all()
-    assert [answer["goal"]["name"] for answer in policy.answers] == ["cup"] * 4
+    assert [reply["goal"]["name"] for reply in policy.replies] == ["cup"] * 4
     assert policy.session.counts.episodes == 1
     moved = abs(np.diff([0.25, *targets[:, 6]])) > 0.05
     assert gripper is None or bool(gripper.calls) == bool(moved.any())
@@ -186,10 +186,10 @@ def test_example_client_does_not_move_after_an_error_or_in_a_dry_run(drive: Driv
     policy = Policy()
     with pytest.raises(RuntimeError, match="unknown goal"):
         drive(policy, goal="plate")
-    assert not policy.answers
+    assert not policy.replies
     policy.max_replies = 1
     positions, _ = drive(policy)
-    assert len(positions) == 1, "one step, and none after the error"
+    assert len(positions) == 1, "one motion before the error, none after it"
     positions, gripper = drive(Policy(dry_run=True))
     np.testing.assert_allclose(positions, np.tile([0.45, 0.0, 0.3], (4, 1)), atol=1e-9)
     assert gripper is None or not gripper.calls

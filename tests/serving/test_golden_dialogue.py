@@ -11,24 +11,24 @@ from vjepa2_ac.serving.session import Session
 from vjepa2_ac.serving.wire import pack, unpack
 
 FOLDER = ROOT / "tests/golden/openpi"
-FRAMES = sorted(FOLDER.glob("*.bin"))
+MESSAGE_PATHS = sorted(FOLDER.glob("*.bin"))
 
 
-MADE = runpy.run_path(str(FOLDER / "make.py"))
-picture = MADE["picture"]
+EXAMPLES = runpy.run_path(str(FOLDER / "make.py"))
+make_image = EXAMPLES["picture"]
 
 
 def get_replies(messages: list[bytes]) -> list[dict | str]:
-    served: Session = session(goals={"cup": (SubGoal(picture(20), "cup"),)})
-    replies = [served.answer(message) for message in messages]
+    served: Session = session(goals={"cup": (SubGoal(make_image(20), "cup"),)})
+    replies = [served.reply_to(message) for message in messages]
     return [unpack(reply) if isinstance(reply, bytes) else reply for reply in replies]
 
 
 def test_recorded_openpi_messages_get_the_same_replies_as_messages_of_our_client() -> None:
-    assert [path.stem for path in FRAMES] == list(MADE["DIALOGUE"])
-    openpi_replies = get_replies([path.read_bytes() for path in FRAMES])
-    own_replies = get_replies([pack(message) for message in MADE["DIALOGUE"].values()])
-    for path, reply, expected in zip(FRAMES, openpi_replies, own_replies, strict=True):
+    assert [path.stem for path in MESSAGE_PATHS] == list(EXAMPLES["DIALOGUE"])
+    openpi_replies = get_replies([path.read_bytes() for path in MESSAGE_PATHS])
+    own_replies = get_replies([pack(message) for message in EXAMPLES["DIALOGUE"].values()])
+    for path, reply, expected in zip(MESSAGE_PATHS, openpi_replies, own_replies, strict=True):
         if isinstance(expected, str):
             assert reply == expected, path.name
             assert "degrees" in reply

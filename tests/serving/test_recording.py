@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from served import STATE, controller, image, request, session
+from served import STATE, image, make_controller, request, session
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import read_image
 from vjepa2_ac.serving import recording
@@ -19,8 +19,8 @@ from vjepa2_ac.serving.wire import pack, unpack
 
 def record(folder: Path, served: Session, requests: list[dict], max_bytes: int = 10**8) -> list[dict]:
     served.recorder = Recorder(folder, {"model": "tiny"}, max_bytes)
-    answers = [unpack(served.answer(pack(message))) for message in requests]
-    assert all(answer["why"] for answer in answers)
+    replies = [unpack(served.reply_to(pack(message))) for message in requests]
+    assert all(reply["why"] for reply in replies)
     return read_lines(folder)
 
 
@@ -35,10 +35,12 @@ def test_recorded_line_contains_images_state_and_reply(tmp_path: Path) -> None:
     requests = [request(step, goal_image=image(100), goal_mask=mask) for step in (0, 1, 0)]
     lines = record(tmp_path / "record", session(), requests)
     for line, message in zip(lines, requests, strict=True):
-        frame, goal, seen = (read_image(tmp_path / "record" / name) for name in (line["frame"], *line["goals"]))
+        frame, goal, recorded_mask = (
+            read_image(tmp_path / "record" / name) for name in (line["frame"], *line["goals"])
+        )
         np.testing.assert_array_equal(frame, message["observation/image"])
         np.testing.assert_array_equal(goal, image(100))
-        np.testing.assert_array_equal(seen[..., 0] > 0, mask)
+        np.testing.assert_array_equal(recorded_mask[..., 0] > 0, mask)
         assert (line["state"], line["episode"]) == (STATE.tolist(), 1)
         assert np.shape(line["answer"]["actions"]) == (2, 7)
     assert len(list((tmp_path / "record" / IMAGES_FOLDER).iterdir())) == 4, "each image is stored once"
@@ -54,7 +56,7 @@ def test_recording_stops_at_the_size_limit_and_the_server_continues(
     assert 0 < len(lines) < 8
     assert caplog.text.count("the size limit is reached") == 1
     assert sum(path.stat().st_size for path in (tmp_path / "record").rglob("*") if path.is_file()) <= 60_000
-    assert unpack(served.answer(pack(request(9))))["why"] == "planned"
+    assert unpack(served.reply_to(pack(request(9))))["why"] == "planned"
 
 
 def test_disk_error_stops_the_recording_but_no_decision(tmp_path: Path, caplog, monkeypatch) -> None:
@@ -67,8 +69,8 @@ def test_disk_error_stops_the_recording_but_no_decision(tmp_path: Path, caplog, 
     monkeypatch.setattr(recording, "write_atomically", fail)
     with caplog.at_level(logging.WARNING):
         for step in (1, 2):
-            assert unpack(served.answer(pack(request(step))))["why"] == "planned"
-        assert unpack(served.answer(pack(request(3, goal_image=image(101)))))["why"] == "planned"
+            assert unpack(served.reply_to(pack(request(step))))["why"] == "planned"
+        assert unpack(served.reply_to(pack(request(3, goal_image=image(101)))))["why"] == "planned"
     assert caplog.text.count("No space left on device") == 1
     assert len(read_lines(tmp_path / "record")) == 1
 
@@ -76,14 +78,14 @@ def test_disk_error_stops_the_recording_but_no_decision(tmp_path: Path, caplog, 
 def test_recording_into_an_existing_folder_raises(tmp_path: Path) -> None:
     (tmp_path / "old").mkdir()
     (tmp_path / "old/notes").write_text("mine")
-    for place in (tmp_path / "old", tmp_path / "old/notes"):
+    for path in (tmp_path / "old", tmp_path / "old/notes"):
         with pytest.raises(InputError, match="old"):
-            Recorder(place, {})
+            Recorder(path, {})
     assert (tmp_path / "old/notes").read_text() == "mine"
 
 
 def test_dry_run_records_the_planned_states(tmp_path: Path) -> None:
-    dry = Session(controller(), None, SessionOptions(dry_run=True))
-    (line,) = record(tmp_path / "record", dry, [request(0, goal_image=image(100))])
+    served = Session(make_controller(), None, SessionOptions(dry_run=True))
+    (line,) = record(tmp_path / "record", served, [request(0, goal_image=image(100))])
     assert not np.any(line["answer"]["actions"])
     assert line["answer"]["planned"][0][:3] != STATE[:3].tolist()

@@ -16,7 +16,7 @@ import websockets.sync.client
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from ranks import wait_until
-from served import STATE, Running, controller, image, request, serving, session
+from served import STATE, Running, image, make_controller, request, serving, session
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.serving import access
 from vjepa2_ac.serving.access import Access
@@ -33,15 +33,17 @@ def get(running: Running, path: str, **headers: str) -> tuple[int, str]:
     connection = http.client.HTTPConnection(host, int(port), timeout=120)
     try:
         connection.request("GET", path, headers=headers)
-        answer = connection.getresponse()
-        return answer.status, answer.read().decode()
+        response = connection.getresponse()
+        return response.status, response.read().decode()
     finally:
         connection.close()
 
 
 @contextlib.contextmanager
-def connect(running: Running, **how: object) -> Iterator[websockets.sync.client.ClientConnection]:
-    with websockets.sync.client.connect(running.url, compression=None, max_size=None, proxy=None, **how) as connection:
+def connect(running: Running, **options: object) -> Iterator[websockets.sync.client.ClientConnection]:
+    with websockets.sync.client.connect(
+        running.url, compression=None, max_size=None, proxy=None, **options
+    ) as connection:
         yield connection
 
 
@@ -55,7 +57,7 @@ class SlowSession:
             threading.Event(),
             threading.Event(),
         )
-        plan, answer = self.session.controller.planner.plan, self.session.answer
+        plan = self.session.controller.planner.plan
 
         def slow_plan(*args: object) -> object:
             self.is_planning.set()
@@ -67,19 +69,18 @@ class SlowSession:
             return plan(*args)
 
         self.session.controller.planner.plan = slow_plan
-        self.answer = answer
 
 
-def test_actions_through_the_socket_equal_the_controllers_actions() -> None:
-    own = controller()
-    own.reset(image(100))
+def test_actions_received_over_the_socket_equal_those_of_the_controller() -> None:
+    controller = make_controller()
+    controller.reset(image(100))
     with serving(session) as running, PlanningClient(running.url) as client:
         for step in range(3):
             reply = client.infer(request(step, goal_image=image(100)))
-            np.testing.assert_array_equal(reply["actions"][0], own.act(image(step), STATE))
+            np.testing.assert_array_equal(reply["actions"][0], controller.act(image(step), STATE))
         with pytest.raises(InputError, match="frame: 32 x 24 pixels"):
             client.infer(request(3) | {"observation/image": image(3, 24, 32)})
-        np.testing.assert_array_equal(client.infer(request(3))["actions"][0], own.act(image(3), STATE))
+        np.testing.assert_array_equal(client.infer(request(3))["actions"][0], controller.act(image(3), STATE))
 
 
 def test_server_listens_only_after_the_model_is_loaded() -> None:
@@ -103,27 +104,27 @@ def test_server_listens_only_after_the_model_is_loaded() -> None:
 
 def test_used_port_raises_before_and_after_loading() -> None:
     def load() -> tuple[Session, dict]:
-        taken.append(socket.create_server(("127.0.0.1", port)))
+        late_sockets.append(socket.create_server(("127.0.0.1", port)))
         return session(), {}
 
-    taken = list[socket.socket]()
+    late_sockets = list[socket.socket]()
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     for _ in range(2):
         with pytest.raises(InputError, match=f"127.0.0.1:{port}: the server cannot listen"):
             asyncio.run(PlanningServer(Access("127.0.0.1"), port, print).run(load, asyncio.Event()))
-    (own,) = taken
-    own.close()
+    (late_socket,) = late_sockets
+    late_socket.close()
 
 
 def test_server_stopped_while_loading_does_not_listen() -> None:
-    async def stopped() -> bool:
+    async def stop_while_loading() -> bool:
         stop = asyncio.Event()
         asyncio.get_running_loop().call_later(0.1, stop.set)
         return await PlanningServer(Access("127.0.0.1"), 0, print).run(lambda: (go.wait(120), session())[1:] * 2, stop)
 
     go = threading.Event()
-    assert not asyncio.run(stopped()), "the planning thread has not ended"
+    assert not asyncio.run(stop_while_loading()), "the planning thread has not ended"
     go.set()
 
 
@@ -145,18 +146,18 @@ def test_second_robot_is_rejected_until_the_first_disconnects() -> None:
 def test_pings_are_answered_during_a_long_decision() -> None:
     slow = SlowSession()
 
-    async def drive(url: str) -> None:
+    async def ping_during_decision(url: str) -> None:
         async with websockets.asyncio.client.connect(url, compression=None, proxy=None) as connection:
             await connection.recv()
             await connection.send(pack(request(0, goal_image=image(100))))
             await asyncio.to_thread(slow.is_planning.wait, 120)
             for _ in range(3):
                 await asyncio.wait_for(await connection.ping(), 120)
-            slow.go.set()  # not before
+            slow.go.set()
             assert unpack(await connection.recv())["why"] == "planned"
 
     with serving(lambda: slow.session) as running:
-        asyncio.run(drive(running.url))
+        asyncio.run(ping_during_decision(running.url))
 
 
 def test_disconnect_cancels_the_search_and_the_next_client_is_served() -> None:
@@ -214,25 +215,25 @@ def test_requests_from_web_pages_are_rejected() -> None:
 
 
 def test_invalid_message_gets_an_error_and_the_next_request_is_served() -> None:
-    good, rng = bytearray(pack(request(0, goal_image=image(100)))), random.Random(0)  # noqa: S311
+    valid, rng = bytearray(pack(request(0, goal_image=image(100)))), random.Random(0)  # noqa: S311
     with serving(session) as running, connect(running) as connection:
         connection.recv()
         connection.send("a text")
         assert connection.recv(timeout=120) == "received a text message. Expected a binary message in msgpack"
         for _ in range(300):
-            wrong = bytearray(good)
+            mutated = bytearray(valid)
             for _ in range(rng.randint(1, 4)):
-                wrong[rng.randrange(120)] = rng.randrange(256)
-            connection.send(bytes(wrong[: rng.choice([len(wrong), rng.randrange(len(wrong))])]))
-            answer = connection.recv(timeout=120)
-            assert isinstance(answer, bytes) or (len(answer) < 1000 and "Traceback" not in answer)
-        connection.send(bytes(good))
+                mutated[rng.randrange(120)] = rng.randrange(256)
+            connection.send(bytes(mutated[: rng.choice([len(mutated), rng.randrange(len(mutated))])]))
+            reply = connection.recv(timeout=120)
+            assert isinstance(reply, bytes) or (len(reply) < 1000 and "Traceback" not in reply)
+        connection.send(bytes(valid))
         reply = unpack(connection.recv(timeout=120))
         assert reply["why"] == "planned"
-        figures = get(running, "/metrics")[1]
-        assert "requests_failed_total 0" in figures
-        assert 'decisions_total{why="planned"} ' in figures
-        assert "decision_seconds_count" in figures
+        metrics = get(running, "/metrics")[1]
+        assert "requests_failed_total 0" in metrics
+        assert 'decisions_total{why="planned"} ' in metrics
+        assert "decision_seconds_count" in metrics
 
 
 def test_too_large_message_closes_the_connection_but_not_the_server() -> None:
@@ -251,14 +252,14 @@ def test_too_large_message_closes_the_connection_but_not_the_server() -> None:
 
 def test_server_shutdown_does_not_wait_for_uncancellable_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(access, "SHUTDOWN_TIMEOUT_S", 0.1)
-    served, is_answering, go = session(), threading.Event(), threading.Event()
-    served.answer = lambda *_: (is_answering.set(), go.wait(120))[1]
+    served, is_replying, go = session(), threading.Event(), threading.Event()
+    served.reply_to = lambda *_: (is_replying.set(), go.wait(120))[1]
     with contextlib.ExitStack() as client:
         with serving(lambda: served) as running:
             connection = client.enter_context(connect(running))
             connection.recv()
             connection.send(pack(request(0, endpoint="score")))
-            assert is_answering.wait(120)
+            assert is_replying.wait(120)
         assert not go.is_set()
         go.set()
 

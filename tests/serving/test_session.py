@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from decisions import make_vector_controller
-from served import STATE, controller, image, request, session
+from served import STATE, image, make_controller, request, session
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
@@ -33,31 +33,31 @@ CUP = {"cup": (SubGoal(image(50), "cup"),), "two": (SubGoal(image(51), "a", at_m
 
 
 def ask(served: Session, **keys: object) -> dict:
-    answer = served.answer(pack(keys))
-    assert isinstance(answer, bytes), answer
-    return unpack(answer)
+    reply = served.reply_to(pack(keys))
+    assert isinstance(reply, bytes), reply
+    return unpack(reply)
 
 
 def get_error(served: Session, **keys: object) -> str:
-    answer = served.answer(pack(keys))
-    assert isinstance(answer, str)
-    return answer
+    reply = served.reply_to(pack(keys))
+    assert isinstance(reply, str)
+    return reply
 
 
 @pytest.mark.parametrize("changes", [{}, {"context": 2, "warm_start": True}])
 def test_reply_equals_the_controllers_decision_bit_for_bit(changes: dict) -> None:
-    served, own = session(**changes), controller(**changes)
-    own.reset(image(100))
+    served, controller = session(**changes), make_controller(**changes)
+    controller.reset(image(100))
     for step in range(3):
-        goal = {"goal_image": image(100)} if step != 1 else {}  # a client may send it every time, or once
+        goal = {"goal_image": image(100)} if step != 1 else {}  # a client may send the goal once or with every request
         reply = ask(served, **request(step, **goal))
-        action = own.act(image(step), STATE)
+        action = controller.act(image(step), STATE)
         np.testing.assert_array_equal(reply["actions"][0], action)
         assert reply["actions"].shape == (2, 7)
         assert reply["actions"].dtype == np.float64
-        np.testing.assert_array_equal(reply["actions"], own.decision.plan.actions.double().numpy())
-        np.testing.assert_array_equal(reply["target"], own.decision.states[1:])
-        assert reply["energy"] == {"now": own.decision.current_energy, "plan": own.decision.plan.energy}
+        np.testing.assert_array_equal(reply["actions"], controller.decision.plan.actions.double().numpy())
+        np.testing.assert_array_equal(reply["target"], controller.decision.states[1:])
+        assert reply["energy"] == {"now": controller.decision.current_energy, "plan": controller.decision.plan.energy}
         assert reply["why"] == "planned"
         assert reply["server_timing"].keys() == {"infer_ms"} | ({"prev_total_ms"} if step else set())
 
@@ -67,7 +67,7 @@ def test_all_arrays_of_a_reply_have_one_row_per_action() -> None:
     for form, rows in (("delta", 2), ("pose", 4)):
         reply = ask(session(SessionOptions(form)), **request(goal_image=image(1)))
         arrays_in = [value for value in reply.values() if isinstance(value, np.ndarray)]
-        assert [one.shape for one in arrays_in] == [(rows, 7)]
+        assert [array.shape for array in arrays_in] == [(rows, 7)]
 
 
 def test_named_goal_or_prompt_selects_a_goal_of_the_server() -> None:
@@ -107,7 +107,7 @@ def test_invalid_request_does_not_change_the_next_reply() -> None:
     assert "frame: 32 x 24 pixels" in get_error(served, **request(1) | {"observation/image": image(1, 24, 32)})
     assert "degrees" in get_error(served, **request(1) | {"observation/state": STATE * [1, 1, 1, 60, 1, 1, 1]})
     assert "finite numbers" in get_error(served, **request(1) | {"observation/state": STATE * np.nan})
-    assert served.answer(b"\xc1") == "the message is not valid msgpack within the size limits (FormatError)"
+    assert served.reply_to(b"\xc1") == "the message is not valid msgpack within the size limits (FormatError)"
     np.testing.assert_array_equal(ask(served, **request(1))["actions"], expected[1])
     assert (served.counts.rejected, served.counts.failed) == (4, 0)
 
@@ -139,8 +139,8 @@ class _ExpiringClock:
 
 
 def test_deadline_returns_the_zero_action_and_does_not_change_the_next_decision() -> None:
-    own = controller()
-    late = Session(own, None, SessionOptions(deadline_s=2.5), clock=_ExpiringClock(2))
+    controller = make_controller()
+    late = Session(controller, None, SessionOptions(deadline_s=2.5), clock=_ExpiringClock(2))
     reply = ask(late, **request(0, goal_image=image(100)))
     assert reply["why"] == "past the deadline"
     assert not reply["actions"].any()
@@ -154,22 +154,22 @@ def test_deadline_returns_the_zero_action_and_does_not_change_the_next_decision(
 def test_disconnect_ends_the_search_within_one_iteration() -> None:
     served, calls = session(iterations=50), []
 
-    def gone() -> bool:
+    def is_disconnected() -> bool:
         calls.append(1)
         return len(calls) > 3
 
     with pytest.raises(ClientDisconnectedError):
-        served.answer(pack(request(0, goal_image=image(100))), gone)
+        served.reply_to(pack(request(0, goal_image=image(100))), is_disconnected)
     assert len(calls) < 7
 
 
 def test_dry_run_plans_and_sends_zero_actions() -> None:
-    wet = ask(session(), **request(0, goal_image=image(100)))
+    live = ask(session(), **request(0, goal_image=image(100)))
     dry = ask(session(SessionOptions(dry_run=True)), **request(0, goal_image=image(100)))
     assert dry["dry_run"] is True
     assert not dry["actions"].any()
     assert dry["target"] == [STATE.tolist()]
-    assert dry["planned"] == wet["target"]
+    assert dry["planned"] == live["target"]
     poses = ask(session(SessionOptions("pose", dry_run=True)), **request(0, goal_image=image(100)))
     np.testing.assert_allclose(poses["actions"], np.tile(STATE, (4, 1)), atol=1e-12)
 
@@ -193,7 +193,7 @@ class _UnsafeController(Controller):
 
 @pytest.fixture(scope="module")
 def unsafe_session() -> Session:
-    safe = controller(limits=LIMITS)
+    safe = make_controller(limits=LIMITS)
     unsafe, plans = _UnsafeController(safe._model, safe.config), []
     search = unsafe.planner.plan
 
@@ -206,27 +206,29 @@ def unsafe_session() -> Session:
 
 
 LARGEST = np.array([*LIMITS.xyz_m, *[LIMITS.rotation] * 3, 1.0])
-WILD = arrays(np.float64, (2, 7), elements=st.floats(allow_nan=True, allow_infinity=True) | st.floats(-0.2, 0.2))
-SHARES = st.sampled_from([0.0, 0.5, 0.99, 1.5])  # of the limits of position, rotation and gripper
-NEAR = st.builds(
-    lambda shares, parts: shares * np.repeat(parts, [3, 3, 1]) * LARGEST,
+ANY_ACTIONS = arrays(np.float64, (2, 7), elements=st.floats(allow_nan=True, allow_infinity=True) | st.floats(-0.2, 0.2))
+LIMIT_FRACTIONS = st.sampled_from([0.0, 0.5, 0.99, 1.5])  # of the limits of position, rotation and gripper
+ACTIONS_NEAR_LIMITS = st.builds(
+    lambda directions, fractions: directions * np.repeat(fractions, [3, 3, 1]) * LARGEST,
     arrays(np.float64, (2, 7), elements=st.floats(-1.0, 1.0)),
-    st.tuples(SHARES, SHARES, SHARES),
+    st.tuples(LIMIT_FRACTIONS, LIMIT_FRACTIONS, LIMIT_FRACTIONS),
 )
 
 
 @settings(max_examples=150, deadline=None)
-@example(np.array([[0.04, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]] * 2), "delta", 0.4)  # together they leave the workspace
-@given(WILD | NEAR, st.sampled_from(["delta", "pose"]), st.floats(0.26, 0.5))
+@example(
+    np.array([[0.04, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]] * 2), "delta", 0.4
+)  # both actions together leave the workspace
+@given(ANY_ACTIONS | ACTIONS_NEAR_LIMITS, st.sampled_from(["delta", "pose"]), st.floats(0.26, 0.5))
 def test_sent_action_is_within_the_limits_for_any_plan(
     unsafe_session: Session, planned_actions: np.ndarray, form: ActionForm, x: float
 ) -> None:
     unsafe_session.controller.planned_actions, unsafe_session.options = planned_actions, SessionOptions(form)
     state, frame = np.array([x, *STATE[1:]]), image(int(1e9 * x))  # the frame differs for each position of the arm
-    answer = unsafe_session.answer(
+    reply = unsafe_session.reply_to(
         pack({"observation/image": frame, "observation/state": state, "goal/image": image(100)})
     )
-    reply = unpack(answer)
+    reply = unpack(reply)
     sent = reply["actions"]
     assert np.isfinite(sent).all()
     steps = sent
@@ -271,9 +273,9 @@ def test_plan_with_one_number_beyond_its_limit_is_not_sent(step: int, axis: int,
 def test_float32_rounding_of_limits_is_tolerated() -> None:
     for axis, limit in ((0, 0.05), (3, 0.1)):
         assert find_limit_violation(STATE, changed(0, axis, limit + 5e-7), PLAIN, POSE) == ""
-    widest = PLAIN.model_copy(update={"rotation": np.pi})
-    assert find_limit_violation(STATE, changed(0, 3, np.pi), widest, POSE) == ""
-    assert "rotation" in find_limit_violation(STATE, changed(0, 3, np.pi + 5e-7), widest, POSE), (
+    limits = PLAIN.model_copy(update={"rotation": np.pi})
+    assert find_limit_violation(STATE, changed(0, 3, np.pi), limits, POSE) == ""
+    assert "rotation" in find_limit_violation(STATE, changed(0, 3, np.pi + 5e-7), limits, POSE), (
         "a rotation beyond pi is a rotation in the other direction"
     )
 
@@ -292,11 +294,11 @@ def test_rotation_outside_the_workspace_is_allowed() -> None:
     outside, turn = np.array([0.5, *STATE[1:]]), np.zeros((2, 7))
     turn[:, 3:] = 0.05
     assert find_limit_violation(outside, turn, LIMITS, POSE) == ""
-    turn[0, 0] = -0.01  # not far enough
+    turn[0, 0] = -0.01  # ends outside the workspace
     assert "workspace" in find_limit_violation(outside, turn, LIMITS, POSE)
 
 
-def test_vector_changes_must_be_within_the_axis_limits() -> None:
+def test_vector_changes_must_be_within_their_limits() -> None:
     space, limits = make_vector_states(3), LimitsConfig(axes=(0.1, 0.2, 0.0))
     changes = np.array([[0.1, -0.2, 0.0], [-0.1, 0.2, 0.0]])
     assert find_limit_violation(np.zeros(3), changes, limits, space) == ""
@@ -323,25 +325,25 @@ def test_padded_image_adds_a_note() -> None:
 
 def test_vector_states_get_changes_or_targets_and_reject_poses() -> None:
     for joined in ("sum", "last"):
-        own, state = make_vector_controller(joined), np.full(8, 0.1)
-        own.reset(image(100))
+        controller, state = make_vector_controller(joined), np.full(8, 0.1)
+        controller.reset(image(100))
         message = {"observation/image": image(0), "observation/state": state, "goal/image": image(100)}
-        reply = unpack(Session(make_vector_controller(joined)).answer(pack(message)))
-        np.testing.assert_array_equal(reply["actions"][0], own.act(image(0), state))
+        reply = unpack(Session(make_vector_controller(joined)).reply_to(pack(message)))
+        np.testing.assert_array_equal(reply["actions"][0], controller.act(image(0), state))
         assert reply["actions"].shape == (2, 8)
-        nothing = unpack(Session(own, None, SessionOptions(dry_run=True)).answer(pack(message)))
-        np.testing.assert_array_equal(nothing["actions"], np.tile(state if joined == "last" else 0 * state, (2, 1)))
+        dry = unpack(Session(controller, None, SessionOptions(dry_run=True)).reply_to(pack(message)))
+        np.testing.assert_array_equal(dry["actions"], np.tile(state if joined == "last" else 0 * state, (2, 1)))
         with pytest.raises(InputError, match="--actions pose: the states of the model are not poses"):
-            Session(own, None, SessionOptions("pose"))
+            Session(controller, None, SessionOptions("pose"))
 
 
 def test_score_of_policy_chunks_makes_no_decision() -> None:
-    served, own = session(), controller()
-    own.reset(image(100))
+    served, controller = session(), make_controller()
+    controller.reset(image(100))
     chunks = STATE + np.random.default_rng(0).normal(0, 0.01, (3, 8, 7)) * [1, 1, 1, 1, 1, 1, 0]
     keys = {"endpoint": "score", "policy/chunks": chunks}
     reply = ask(served, **request(goal_image=image(100), **keys))
-    expected = own.score(image(0), STATE, changes_of_chunks(chunks, STATE, form="targets", control_steps=4))
+    expected = controller.score(image(0), STATE, changes_of_chunks(chunks, STATE, form="targets", control_steps=4))
     np.testing.assert_array_equal(reply["energies"], expected.energies)
     assert (reply["best"], reply["tied"], reply["is_blind"]) == (expected.best, expected.tied, False)
     assert not served.counts.decisions
@@ -353,11 +355,11 @@ def test_score_of_policy_chunks_makes_no_decision() -> None:
 
 
 def test_search_starts_from_policy_chunks() -> None:
-    own = controller()
-    own.reset(image(100))
+    controller = make_controller()
+    controller.reset(image(100))
     chunks = np.tile(np.array([0.01, 0.0, -0.005, 0, 0, 0, 0.0]), (4, 8, 1))
     changes = changes_of_chunks(chunks, STATE, form="deltas", control_steps=4)
-    action = own.act(image(0), STATE, samples=changes)
+    action = controller.act(image(0), STATE, samples=changes)
     reply = ask(session(), **request(goal_image=image(100), **{"policy/chunks": chunks, "policy/form": "deltas"}))
     np.testing.assert_array_equal(reply["actions"][0], action)
     assert not np.array_equal(action, ask(session(), **request(goal_image=image(100)))["actions"][0])
@@ -387,22 +389,22 @@ SCORE = {"endpoint": "score", "policy/chunks": CHUNKS}
 def test_cancelled_score_stops_after_the_current_batch(ended_by: str, monkeypatch: pytest.MonkeyPatch) -> None:
     served = session(energy=EnergyConfig(samples_at_once=16))
     ask(served, **request(goal_image=image(100)))
-    parts: list[int] = []
+    batch_sizes: list[int] = []
     rollout = served.controller._model.rollout
 
-    def counted(frame: torch.Tensor, *more: object, **how: object) -> object:
-        parts.append(len(frame))
+    def record_batch(frame: torch.Tensor, *more: object, **how: object) -> object:
+        batch_sizes.append(len(frame))
         return rollout(frame, *more, **how)
 
-    monkeypatch.setattr(served.controller._model, "rollout", counted)
+    monkeypatch.setattr(served.controller._model, "rollout", record_batch)
     message = pack(request(1, **SCORE))
     if ended_by == "client":
         with pytest.raises(ClientDisconnectedError):
-            served.answer(message, lambda: bool(parts))
+            served.reply_to(message, lambda: bool(batch_sizes))
     else:
         served._clock = _ExpiringClock(2)
-        assert served.answer(message).startswith("request: not finished within the deadline")
-    assert parts == [16]
+        assert served.reply_to(message).startswith("request: not finished within the deadline")
+    assert batch_sizes == [16]
 
 
 @pytest.mark.parametrize("endpoint", ["infer", "reset"])
@@ -411,13 +413,13 @@ def test_goal_encoding_stops_at_the_deadline(endpoint: str, monkeypatch: pytest.
     monkeypatch.setattr(served.controller, "encode", lambda _: encoded.append(1) or torch.zeros(9, 32))
     served._clock = _ExpiringClock(3)
     goals = {"goal/images": np.stack([image(seed) for seed in range(5)]), "goal/rules": [{"at_most": 1}] * 4 + [{}]}
-    answer = served.answer(pack(request(**goals) | {"endpoint": endpoint}))
+    reply = served.reply_to(pack(request(**goals) | {"endpoint": endpoint}))
     assert len(encoded) == 2
     if endpoint == "infer":
-        reply = unpack(answer)
+        reply = unpack(reply)
         assert (reply["why"], reply["goal"], reply["actions"].any()) == ("past the deadline", None, np.False_)
     else:
-        assert answer.startswith("request: not finished within the deadline")
+        assert reply.startswith("request: not finished within the deadline")
     served._clock = lambda: 0.0
     monkeypatch.undo()
     assert "no goal was set in this episode" in get_error(served, **request())

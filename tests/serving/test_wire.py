@@ -36,24 +36,24 @@ def array_of(dtype: object = "<f4", shape: object = (2,), data: object = b"\0" *
 
 @given(MESSAGES)
 def test_message_survives_encoding_and_decoding(message) -> None:
-    found = unpack(pack(message))
-    np.testing.assert_equal(found, dict(message))
+    decoded = unpack(pack(message))
+    np.testing.assert_equal(decoded, dict(message))
 
 
 def test_decoded_arrays_keep_their_type_and_are_writable() -> None:
-    found = unpack(pack({"a": np.arange(6, dtype=np.float32).reshape(2, 3)[:, ::2], "n": np.float64(0.1)}))
-    assert found["a"].dtype == np.float32
-    assert found["a"].flags.writeable
-    np.testing.assert_array_equal(found["a"], [[0, 2], [3, 5]])
-    assert found["n"] == 0.1
+    decoded = unpack(pack({"a": np.arange(6, dtype=np.float32).reshape(2, 3)[:, ::2], "n": np.float64(0.1)}))
+    assert decoded["a"].dtype == np.float32
+    assert decoded["a"].flags.writeable
+    np.testing.assert_array_equal(decoded["a"], [[0, 2], [3, 5]])
+    assert decoded["n"] == 0.1
 
 
 HOSTILE = {
     "nothing": b"",
-    "a byte that means nothing": b"\xc1",
+    "an undefined byte": b"\xc1",
     "a list": msgpack.packb([1, 2]),
     "a number": b"\x01",
-    "an array alone": msgpack.packb({b"__ndarray__": True, b"data": b"\0", b"dtype": "|u1", b"shape": [1]}),
+    "an array without a map": msgpack.packb({b"__ndarray__": True, b"data": b"\0", b"dtype": "|u1", b"shape": [1]}),
     "two messages": pack({"a": 1}) + pack({"a": 1}),
     "half a message": pack({"a": np.zeros(5)})[:-3],
     "a number as key": msgpack.packb({1: 2}),
@@ -62,7 +62,7 @@ HOSTILE = {
     "a key twice": b"\x82\xa1a\x01\xa1a\x02",
     "an extension": msgpack.packb({"a": msgpack.ExtType(3, b"x")}),
     "a time": msgpack.packb({"a": msgpack.Timestamp(3)}),
-    "no text": b"\x81\xa1\xff\x01",
+    "invalid UTF-8": b"\x81\xa1\xff\x01",
     "surrogates": b"\x81\xa1a\xa3\xed\xa0\x80",
     "deep lists": b"\x81\xa1a" + b"\x91" * 500 + b"\x01",
     "deeper lists": b"\x81\xa1a" + b"\x91" * 100_000 + b"\x01",
@@ -75,7 +75,7 @@ HOSTILE = {
     "a long text": msgpack.packb({"a": "x" * 5000}),
     "objects": array_of("|O"),
     "objects of eight bytes": array_of("|O8"),
-    "nothing of a size": array_of("|V0", [2**40], b""),
+    "items of zero bytes": array_of("|V0", [2**40], b""),
     "records": array_of("<f4,<f4"),
     "a list of types": array_of([["a", "<f4"]]),
     "other byte order": array_of(">f4"),
@@ -88,19 +88,19 @@ HOSTILE = {
     "too many bytes": array_of(shape=(1,)),
     "negative sides": array_of(shape=(-2, -1)),
     "one negative side": array_of(shape=(-2,)),
-    "a side of no number": array_of(shape=(2.0,)),
-    "a side that is true": array_of("|u1", (True,), b"\0"),
-    "huge sides with nothing in them": array_of(shape=(2**62, 0), data=b""),
-    "many axes": array_of(shape=(1, 1, 1, 1, 2)),
-    "a shape of a number": array_of(shape=2),
-    "a shape of an array": array_of(shape={b"__ndarray__": True, b"data": b"\2", b"dtype": "|u1", b"shape": [1]}),
-    "data of text": array_of(data="12345678"),
-    "more keys": array_of(extra=1),
+    "a side that is a float": array_of(shape=(2.0,)),
+    "a side that is a boolean": array_of("|u1", (True,), b"\0"),
+    "huge sides of an empty array": array_of(shape=(2**62, 0), data=b""),
+    "five dimensions": array_of(shape=(1, 1, 1, 1, 2)),
+    "a shape that is a number": array_of(shape=2),
+    "a shape that is an array": array_of(shape={b"__ndarray__": True, b"data": b"\2", b"dtype": "|u1", b"shape": [1]}),
+    "data that are text": array_of(data="12345678"),
+    "an unknown key": array_of(extra=1),
     "a marker that is not true": msgpack.packb(
         {"a": {b"__ndarray__": 1, b"data": b"", b"dtype": "|u1", b"shape": [0]}}
     ),
-    "a number that is a list": msgpack.packb({"a": {b"__npgeneric__": True, b"data": [1], b"dtype": "<f4"}}),
-    "a number of objects": msgpack.packb({"a": {b"__npgeneric__": True, b"data": 1, b"dtype": "|O"}}),
+    "a scalar that is a list": msgpack.packb({"a": {b"__npgeneric__": True, b"data": [1], b"dtype": "<f4"}}),
+    "a scalar of type object": msgpack.packb({"a": {b"__npgeneric__": True, b"data": 1, b"dtype": "|O"}}),
 }
 
 
@@ -136,14 +136,14 @@ GOOD = pack({
 )
 def test_mutated_message_is_decoded_or_raises_wire_error(changes, cut) -> None:
     message = bytearray(GOOD)
-    for place, value in changes:
-        message[place] = value
-    for one in (bytes(message), bytes(message[:cut])):
+    for index, value in changes:
+        message[index] = value
+    for data in (bytes(message), bytes(message[:cut])):
         try:
-            found = unpack(one)
+            decoded = unpack(data)
         except WireError:
             continue
-        assert isinstance(found, dict)
+        assert isinstance(decoded, dict)
 
 
 @settings(max_examples=1000)

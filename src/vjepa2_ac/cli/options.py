@@ -278,12 +278,12 @@ def require_subject(subject: str, config: Config | None = None, command: Sequenc
     Raises:
         InputError: There is no such run or model, or the base model of the run does not exist any more.
     """
-    from vjepa2_ac.model.model_files import find_base, require_base_of_run
+    from vjepa2_ac.model.model_files import find_base, read_sizes, require_base_of_run
 
     if is_run(subject):
         require_base_of_run((config or read_run_config(Path(subject))).model, Path(subject), command)
-    else:
-        find_base(subject)
+    elif (base := find_base(subject)).is_dir():
+        read_sizes(base)
 
 
 def require_to_plan(options: argparse.Namespace) -> Config:

@@ -1,4 +1,4 @@
-"""Models, decoder and held-out episodes of an `explore` session, and the prediction of one more step."""
+"""Models, decoder and held-out episodes of `explore`, and predictions one step at a time."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces, clip_gripper_changes, integrate_states
 
 MAX_STEPS = 16  # longest path in model steps, as in the training of the released model
-_MAX_CACHED_STEPS = 128  # cached predictions per model, for undo and for other branches
+_MAX_CACHED_STEPS = 128  # cached predictions per model, for undo and for alternative actions
 _ACTION_TOLERANCE = 2e-5  # tolerance for equal actions, because links to the page contain rounded numbers
 Pixels = UInt8[np.ndarray, "size size 3"]
 Actions = tuple[tuple[float, ...], ...]
@@ -46,7 +46,7 @@ Simulate = Callable[[int, int, Actions, Cancelled], tuple[np.ndarray, np.ndarray
 
 @dataclass(frozen=True)
 class RolloutPosition:
-    """A position in a rollout, given by the start frame and the actions since then."""
+    """A position in a rollout, defined by its start frame and the actions after that frame."""
 
     episode: int  # index among the episodes of the page
     start: int  # control step
@@ -64,7 +64,7 @@ class RolloutPosition:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A true observation: a frame with its latents, and the state at the same time."""
+    """A true observation: a frame, its latents, and the state at the same time."""
 
     pixels: Pixels  # the input of the encoder
     latents: Float[Tensor, "tokens dim"]
@@ -72,7 +72,7 @@ class Observation:
     action: tuple[float, ...] | None = None  # the recorded action that leads to the next frame; None: unknown
     extrinsics: Float[Tensor, " 6"] | None = None  # pose of the camera, if the model uses it
     is_simulated: bool = False  # whether the frame is simulated; otherwise it was recorded
-    has_reached_target: bool = True  # whether the arm could carry out the last action
+    has_reached_target: bool = True  # whether the arm reached the target of the last action
 
 
 class Explorer:
@@ -91,15 +91,15 @@ class Explorer:
         autocast: Callable[[], Any],
         simulate: Simulate | None = None,
     ) -> None:
-        """Create an explorer; `open_explorer` loads its parts.
+        """Create an explorer from loaded parts; see `open_explorer`.
 
         Args:
             models: The models, on their device.
-            decoder: The decoder of their latents.
+            decoder: The decoder of the models' latents.
             dataset: A data set with clips of two frames of one camera.
             episodes: Indices of the episodes of the page in the data set.
             autocast: Returns the precision context for the models.
-            simulate: Simulates the outcome of other actions; None: the data were not simulated.
+            simulate: Simulates the outcome of actions that were not recorded; None: the data are not from a simulator.
 
         Raises:
             InputError: The data do not define which state follows from an action.
@@ -108,7 +108,7 @@ class Explorer:
         self.decoder, self.dataset, self.episodes, self.autocast = decoder, dataset, episodes, autocast
         self.simulate = simulate
         if self.spaces.action.effect == "unknown":
-            problem = "the effect of the recorded commands on the state is not known"
+            problem = "the effect of the recorded commands on the state is unknown"
             needed = "data.actions: difference, or data.join_actions: sum or last"
             raise InputError(where="data.actions: recorded", found=problem, needed=needed)
         self._cached_pair = lru_cache(maxsize=256)(self._read_pair)
@@ -138,7 +138,7 @@ class Explorer:
         return int(self.dataset.table.num_steps[self.episodes[episode]])
 
     def validate(self, position: RolloutPosition) -> RolloutPosition:
-        """Check a position, and replace actions that are equal to the recorded one up to rounding by the recorded one.
+        """Check a position, and replace actions that equal the recorded actions up to rounding by the recorded actions.
 
         Raises:
             InputError: There is no such frame, or an action is invalid.
@@ -176,7 +176,8 @@ class Explorer:
     def get_recorded_observations(self, position: RolloutPosition) -> list[Observation | None]:
         """Return the recorded observations at the start and after each action.
 
-        An entry is None from the first action on that differs from the recorded one, and after the end of the episode.
+        Observations after the first action that differs from the recorded action are None, as are those after the end
+        of the episode.
         """
         step = position.start
         observations: list[Observation | None] = [self.get_observation(position.episode, step)]
@@ -217,7 +218,7 @@ class Explorer:
     def get_true_observation(
         self, position: RolloutPosition, cancelled: Cancelled = lambda: False
     ) -> Observation | None:
-        """Return the true observation at a position, recorded or else simulated; None if it is unknown.
+        """Return the recorded observation at a position, or else the simulated one; None if there is no simulator.
 
         Raises:
             SearchCancelledError: The simulation was cancelled.
@@ -235,7 +236,7 @@ class Explorer:
     # ---- predictions ----
 
     def integrate_states(self, position: RolloutPosition) -> Float[np.ndarray, "time state_dim"]:
-        """Return the states along a path: recorded while the actions are the recorded ones, then integrated."""
+        """Return the states at the start and after each action: recorded for recorded actions, otherwise integrated."""
         states = [self.get_observation(position.episode, position.start).state]
         for action, recorded in zip(position.actions, self.get_recorded_observations(position)[1:], strict=True):
             following = integrate_states(states[-1], np.array([action]), self.spaces.state)[1]
@@ -243,7 +244,7 @@ class Explorer:
         return np.stack(states)
 
     def predict_latents(self, model_index: int, position: RolloutPosition) -> Float[Tensor, "tokens dim"]:
-        """Return the predicted latents at the end of a path; without actions the true ones.
+        """Return the predicted latents at a position; without actions, the latents of the start frame.
 
         Args:
             model_index: Index of the model in `evaluated_models`.
@@ -255,7 +256,7 @@ class Explorer:
     def _predict_step(
         self, model_index: int, position: RolloutPosition
     ) -> tuple[Float[Tensor, "tokens dim"], KeyValueCache]:
-        """Return the predicted latents at the end of a path, and the key/value cache of all its steps."""
+        """Return the predicted latents at a position, and the key/value cache of all steps before it."""
         if not position.actions:
             return self.get_observation(position.episode, position.start).latents, KeyValueCache()
         (latents, cache), states = (
@@ -279,7 +280,7 @@ class Explorer:
     def get_model(self, model_index: int) -> WorldModel:
         """Return a model. Use it within its `prediction_context()`, because models share weights."""
         model = self.evaluated_models[model_index].model
-        assert isinstance(model, WorldModel)  # noqa: S101  # `load_subject` loads no other
+        assert isinstance(model, WorldModel)  # noqa: S101  # the type that `load_subject` loads
         return model
 
     def get_extrinsics(self, position: RolloutPosition) -> Float[Tensor, " 6"] | None:
@@ -311,7 +312,7 @@ def open_explorer(
         decoder: The decoder of the models' latents.
         split: The split whose episodes are shown.
         load: Loads the models.
-        simulate: Returns the simulator of a data set; None if the data were not simulated.
+        simulate: Returns the simulator of a data set; None if the data are not from a simulator.
         reporter: Shows the progress.
 
     Raises:
@@ -326,9 +327,9 @@ def open_explorer(
     models = load(dataset, decoder)
     models.move_to(accelerator.device)
     decoder.to(accelerator.device)
-    members = dataset.split_mask(split)[dataset.episodes]
-    long_enough = dataset.table.num_steps[dataset.episodes] > config.data.model_stride
-    episodes = tuple(int(index) for index in dataset.episodes[members & long_enough])
+    is_in_split = dataset.split_mask(split)[dataset.episodes]
+    is_long_enough = dataset.table.num_steps[dataset.episodes] > config.data.model_stride
+    episodes = tuple(int(index) for index in dataset.episodes[is_in_split & is_long_enough])
     if not episodes:
         dataset.windows(split)  # raises an error with the reason
     return Explorer(models, decoder, dataset, episodes, accelerator.autocast, simulate(dataset))
@@ -341,15 +342,15 @@ _GRID_POINTS = 7  # points of an energy map along each axis
 
 @dataclass(frozen=True, eq=False)
 class PlanResult:
-    """A plan, and the best sample of each iteration of its search."""
+    """A plan, and predicted frames of the search."""
 
     plan: Plan
-    energy_now: float  # energy of the predicted frame before the plan
-    best: tuple[Float[Tensor, "tokens dim"], ...]  # predicted last frame of the best sample of each iteration
+    energy_now: float  # energy of the frame from which the plan starts
+    best: tuple[Float[Tensor, "tokens dim"], ...]  # last frame of the best sample, for each of the last 8 iterations
 
 
 class Search:
-    """Plans and energy maps that start from predicted frames."""
+    """Computes plans and energy maps from predicted frames."""
 
     def __init__(self, explorer: Explorer, config: PlanningConfig) -> None:
         """Create a search.
@@ -394,7 +395,7 @@ class Search:
 
         Args:
             model_index: Index of the model.
-            position: The position to start from.
+            position: The position before the action.
             goal: Latents of the goal frame.
             action: The action in the middle of the maps.
             progress: Called with the number of evaluated actions.
@@ -443,7 +444,7 @@ class Search:
 
     @contextmanager
     def _open_cost(self, model_index: int, position: RolloutPosition, goal: Tensor) -> Iterator[WorldModelCost]:
-        """Yield the cost function of a search from a position, whose predicted frame is used like an observed one."""
+        """Yield the cost of action sequences from a position; the predicted frame is used like an observed frame."""
         explorer = self._explorer
         state = torch.from_numpy(np.array(explorer.integrate_states(position)[-1], dtype=np.float32))
         scene = Scene(explorer.predict_latents(model_index, position), state, explorer.get_extrinsics(position))

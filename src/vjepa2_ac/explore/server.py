@@ -1,4 +1,4 @@
-"""The server of the page: one socket per page, and one thread that computes the newest request of each page."""
+"""The server of the page: one websocket per page, and one thread that computes the newest request of each page."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _MAX_PAGES = 8  # pages that may be open at the same time
 
 @dataclass
 class _Client:
-    """One page: its pending request, and whether a newer request has replaced the running one."""
+    """The state of one page: the next request, and whether it has replaced the request that is being computed."""
 
     pending: PageRequest | None = None
     has_request: asyncio.Event = field(default_factory=asyncio.Event)
@@ -61,7 +61,7 @@ class ExploreServer:
         """Create a server; it does not listen yet.
 
         Args:
-            views: Answers the requests of pages.
+            views: Computes the replies to the requests of pages.
             port: The port; 0: a free one.
         """
         self._views, self._access, self._port = views, Access("127.0.0.1"), port
@@ -120,8 +120,8 @@ class ExploreServer:
             return
         self._pages += 1
         client, closed = _Client(), require_library("websockets", where="explore", called="websockets", extra="explore")
-        answering = asyncio.ensure_future(self._answer_all(connection, client))
-        answering.add_done_callback(lambda _: asyncio.ensure_future(connection.close()))
+        replies = asyncio.ensure_future(self._send_replies(connection, client))
+        replies.add_done_callback(lambda _: asyncio.ensure_future(connection.close()))
         try:
             with contextlib.suppress(closed.exceptions.ConnectionClosed):
                 async for message in connection:
@@ -130,13 +130,13 @@ class ExploreServer:
         finally:
             self._pages -= 1
             client.is_replaced.set()
-            answering.cancel()
-            for error in await asyncio.gather(answering, return_exceptions=True):
+            replies.cancel()
+            for error in await asyncio.gather(replies, return_exceptions=True):
                 if isinstance(error, Exception) and not isinstance(error, closed.exceptions.ConnectionClosed):
                     logger.error("the connection to a page was closed after an error", exc_info=error)
 
     def _set_request(self, client: _Client, message: str | bytes) -> bytes | None:
-        """Set the pending request of a page, which cancels the running one; return an error if it is invalid."""
+        """Set the next request of a page and cancel the current one; return an error message for an invalid request."""
         try:
             client.pending = read_request(message)
         except InputError as error:
@@ -145,7 +145,8 @@ class ExploreServer:
         client.has_request.set()
         return None
 
-    async def _answer_all(self, connection: Any, client: _Client) -> None:
+    async def _send_replies(self, connection: Any, client: _Client) -> None:
+        """Send the first message, then the reply to the newest request whenever there is one."""
         loop = asyncio.get_running_loop()
         await connection.send(await loop.run_in_executor(self._computing, self._views.make_hello))
         while True:
@@ -159,17 +160,18 @@ class ExploreServer:
                 message = encode_message("progress", seq, {"done": done, "total": total, "what": "action sequences"})
                 asyncio.run_coroutine_threadsafe(connection.send(message), loop)
 
-            answer = await loop.run_in_executor(
-                self._computing, self._answer_request, request, progress, client.is_replaced.is_set
+            reply = await loop.run_in_executor(
+                self._computing, self._make_reply, request, progress, client.is_replaced.is_set
             )
-            if answer is not None:
-                await connection.send(answer)
+            if reply is not None:
+                await connection.send(reply)
 
-    def _answer_request(
+    def _make_reply(
         self, request: PageRequest, progress: Callable[[int, int], None], cancelled: Callable[[], bool]
     ) -> bytes | None:
+        """Return the reply to a request, which may be an error message; None if the request was cancelled."""
         try:
-            return self._views.answer(request, progress, cancelled)
+            return self._views.reply_to(request, progress, cancelled)
         except SearchCancelledError:
             return None
         except UserError as error:
@@ -184,8 +186,8 @@ def _make_file_response(connection: Any, name: str, kind: str) -> Any:
     response = connection.respond(http.HTTPStatus.OK, "")
     response.body = files("vjepa2_ac").joinpath("explore/page", name).read_bytes()
     del response.headers["Content-Type"], response.headers["Content-Length"]
-    lengths = {"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(response.body))}
-    response.headers.update(lengths | _HEADERS)
+    content_headers = {"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(response.body))}
+    response.headers.update(content_headers | _HEADERS)
     return response
 
 

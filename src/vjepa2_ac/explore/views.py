@@ -1,4 +1,4 @@
-"""Messages between the page and the server: requests, and answers with predictions, energies and plans."""
+"""Messages between the page and the server: requests, and replies with predictions, energies and plans."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from vjepa2_ac.planning.planner import Cancelled
 from vjepa2_ac.spaces import Space
 from vjepa2_ac.storage.structured import parse_record, to_plain
 
-_CPU_SEARCH = {"samples": 64, "iterations": 4}  # size of a search on a CPU; docs/planning.md rates its plans
+_CPU_SEARCH = {"samples": 64, "iterations": 4}  # size of a search on a CPU (docs/planning.md)
 _MAX_FRAMES = 16  # frames of an image strip
 _MAX_EPISODES = 500  # episodes in the list of the page
-_MAX_SAMPLED_EPISODES = 32  # episodes that are read to find the one with the most motion, and typical step sizes
-_STEP_PERCENTILE = 90.0  # percentile of the recorded changes that is proposed as step size
-_REST_SHARE = 0.1  # changes below this share of the largest change count as rest
+_MAX_SAMPLED_EPISODES = 32  # episodes that are read to find the most motion and typical step sizes
+_STEP_PERCENTILE = 90.0  # percentile of the recorded changes that is the typical step size
+_REST_SHARE = 0.1  # changes below this fraction of the largest change are not used for the typical step size
 # Step sizes of numbers that never change in the data: positions (m), rotations (rad), grippers, other numbers.
 _DEFAULT_STEPS = (0.05, 0.1, 0.5, 0.05)
 _MOVES: tuple[tuple[str, int | None, int], ...] = (
@@ -52,7 +52,7 @@ _MOVES: tuple[tuple[str, int | None, int], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Answers the requests of a page, independently of the network."""
+    """Computes the replies to the requests of a page. This class does not use the network."""
 
     subject: str
     explorer: Explorer
@@ -60,14 +60,14 @@ class Views:
 
     @classmethod
     def create(cls, subject: str, explorer: Explorer, config: Config) -> Views:
-        """Return the views of an explorer. On a CPU the search is small, unless the config changes `planning`."""
+        """Return the views of an explorer. On a CPU the search is smaller unless the config changes `planning`."""
         planning = config.planning
         if explorer.device.type == "cpu" and planning == PlanningConfig(limits=planning.limits):
             planning = planning.model_copy(update=_CPU_SEARCH)
         return cls(subject, explorer, Search(explorer, planning))
 
-    def answer(self, request: PageRequest, progress: Progress, cancelled: Cancelled) -> bytes:
-        """Return the encoded answer to a request.
+    def reply_to(self, request: PageRequest, progress: Progress, cancelled: Cancelled) -> bytes:
+        """Return the encoded reply to a request.
 
         Args:
             request: The request of a page.
@@ -79,12 +79,12 @@ class Views:
             SearchCancelledError: The search or simulation was cancelled.
         """
         if request.kind == "episode":
-            return self._answer_episode(request)
+            return self._make_episode_reply(request)
         actions = tuple(tuple(action) for action in request.actions)
         position = self.explorer.validate(RolloutPosition(request.episode, request.start, actions))
         if request.kind == "predict":
-            return self._answer_prediction(request, position, cancelled)
-        return self._answer_search(request, position, progress, cancelled)
+            return self._make_prediction_reply(request, position, cancelled)
+        return self._make_search_reply(request, position, progress, cancelled)
 
     def make_hello(self) -> bytes:
         """Return the first message to a page: models, episodes, units, moves, and a proposed start and goal."""
@@ -115,7 +115,7 @@ class Views:
 
     @cached_property
     def episode_names(self) -> list[str]:
-        """The names of the episodes, shortened to the parts in which they differ."""
+        """Names of the episodes, without the parts that all names share."""
         names = [self.explorer.get_episode_name(index) for index in range(len(self.explorer.episodes))]
         short = shorten_names(names)
         return [short[name] for name in names]
@@ -134,9 +134,9 @@ class Views:
                 if typical_sizes[number] > _DEFAULT_STEPS[kind] / 10
                 else _DEFAULT_STEPS[kind]
             )
-        for part in (space.position, space.rotation):
-            if part is not None:
-                steps[part] = [max(steps[part])] * len(steps[part])
+        for component_slice in (space.position, space.rotation):
+            if component_slice is not None:
+                steps[component_slice] = [max(steps[component_slice])] * len(steps[component_slice])
         return [
             {**unit, "name": name, "step": step, "most": 2 * step}
             for unit, name, step in zip(make_displayed_units(space), space.change_names, steps, strict=True)
@@ -144,7 +144,7 @@ class Views:
 
     @property
     def moves(self) -> list[dict[str, Any]]:
-        """The moves that a user can command: name, axis of the action, and sign."""
+        """The moves that a user can command: name, component of the action, and sign."""
         space, moves = self.explorer.spaces.state, _MOVES
         if not space.is_base_pose:
             names = enumerate(space.change_names)
@@ -168,7 +168,7 @@ class Views:
 
     @property
     def _initial_episode_and_goal(self) -> tuple[int, int]:
-        """The proposed start and goal: the episode with the most motion, and its last control step."""
+        """The proposed episode, which has the most motion, and the proposed goal, its last control step."""
         size = self.explorer.spaces.state.size_axes
         lengths = [float(np.linalg.norm(changes[:, size], axis=1).sum()) for changes in self._recorded_changes]
         episode = int(np.argmax(lengths))
@@ -176,7 +176,7 @@ class Views:
 
     @cached_property
     def step_seconds(self) -> float:
-        """Seconds for the prediction and decoding of one step with all models, measured once after a warm-up."""
+        """Time in seconds to predict and decode one step with all models, measured once after a warm-up."""
         zero_action = (0.0,) * len(self.explorer.spaces.state)
         for attempt in range(2):
             start_time, position = time.perf_counter(), RolloutPosition(0, 0, (zero_action,) * (attempt + 1))
@@ -184,9 +184,9 @@ class Views:
                 self.explorer.decode(self.explorer.predict_latents(model_index, position))
         return time.perf_counter() - start_time
 
-    # ---- answers ----
+    # ---- replies ----
 
-    def _answer_episode(self, request: PageRequest) -> bytes:
+    def _make_episode_reply(self, request: PageRequest) -> bytes:
         explorer, index = self.explorer, request.episode
         explorer.validate(RolloutPosition(index, 0))
         last, stride = explorer.get_num_steps(index) - 1, explorer.stride
@@ -197,7 +197,7 @@ class Views:
         ]
         return encode_message("episode", request.seq, {"episode": index, "steps": steps}, images)
 
-    def _answer_prediction(self, request: PageRequest, position: RolloutPosition, cancelled: Cancelled) -> bytes:
+    def _make_prediction_reply(self, request: PageRequest, position: RolloutPosition, cancelled: Cancelled) -> bytes:
         explorer, start = self.explorer, self.explorer.get_observation(position.episode, position.start)
         goal = self._get_goal_observation(request)
         outcome, states = explorer.get_true_observation(position, cancelled), explorer.integrate_states(position)
@@ -258,7 +258,7 @@ class Views:
         grid = size // self.explorer.world_model.sizes.patch_size
         return colour_errors(errors.float().reshape(grid, grid).cpu().numpy(), (size, size)).astype(np.uint8)
 
-    def _answer_search(
+    def _make_search_reply(
         self, request: PageRequest, position: RolloutPosition, progress: Progress, cancelled: Cancelled
     ) -> bytes:
         names = [evaluated_model.name for evaluated_model in self.explorer.evaluated_models]
@@ -296,7 +296,7 @@ class Views:
         return encode_message("energy", request.seq, {"maps": energy_maps, "energy_now": energy_now}, ())
 
 
-# ---- message format: a request is JSON; an answer is a JSON header followed by images ----
+# ---- message format: a request is JSON; a reply is a JSON header followed by images ----
 
 MAX_REQUEST_BYTES = 1 << 16  # size limit of a request
 _QUALITY = 90  # JPEG quality
@@ -318,10 +318,10 @@ class GoalFrame:
 class PageRequest:
     """A request of a page; `kind` determines which fields are used."""
 
-    seq: Index
+    seq: Index  # number of the request, which its reply repeats
     kind: Literal["episode", "predict", "energy", "plan"]
     episode: Index = 0
-    start: Index = 0  # control step of the given frame
+    start: Index = 0  # control step of the start frame
     actions: Annotated[list[Action], Field(max_length=MAX_STEPS)] = field(default_factory=list)
     goal: GoalFrame | None = None
     model: Annotated[str, Field(max_length=200)] = ""  # name of the model, for energy and plan
@@ -346,7 +346,7 @@ def read_request(text: str | bytes) -> PageRequest:
 
 @dataclass(frozen=True)
 class Image:
-    """An image of an answer."""
+    """An image of a reply."""
 
     name: str
     pixels: UInt8[np.ndarray, "height width 3"]
@@ -354,10 +354,10 @@ class Image:
 
 
 def encode_message(kind: str, seq: int | None, values: dict[str, Any], images: Sequence[Image] = ()) -> bytes:
-    """Encode an answer: the length of the header in 4 bytes, the JSON header, and the images as JPEG.
+    """Encode a message to the page: the length of the header in 4 bytes, the JSON header, and the images as JPEG.
 
     Args:
-        kind: The kind of the answer.
+        kind: The kind of the message.
         seq: The number of the request; None for a message without a request.
         values: Further values of the header; numbers that are not finite become null.
         images: The images after the header.

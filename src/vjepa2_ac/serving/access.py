@@ -1,4 +1,4 @@
-"""Access rules and listening address of a websocket server. Access is decided from headers, before any message."""
+"""Access rules and listening address of a websocket server. The headers of a request decide, before any message."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)
 
-MIN_KEY_CHARACTERS = 16  # minimum number of characters of a key
-SHUTDOWN_TIMEOUT_S = 1.5  # seconds that a stopping server waits for connections and computations
+MIN_KEY_CHARACTERS = 16
+SHUTDOWN_TIMEOUT_S = 1.5  # how long a stopping server waits for connections and computations
 _Result = TypeVar("_Result")
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:]+))(?::[0-9]*)?|([0-9a-f:]+)")  # [address]:port, name:port, address
 _SCHEMES = ("api-key", "bearer")  # openpi's clients send api-key
@@ -56,19 +56,19 @@ class Access:
                 machine (DNS rebinding).
             authorization: The header `Authorization`.
         """
-        if not self._is_known(host):
+        if not self._is_known_host(host):
             return 403, "unknown host name in the request; start the server with --allow-host NAME to accept it"
         if self.key is not None and not self._has_key(authorization):
             return 401, "a valid key is required; send the header `Authorization: Api-Key KEY`"
         return None
 
-    def _is_known(self, host: str | None) -> bool:
+    def _is_known_host(self, host: str | None) -> bool:
         """Return whether the header `Host` is an IP address or one of this server's names."""
-        parts = _HOST.fullmatch((host or "").strip().lower())
-        if parts is None:
+        match = _HOST.fullmatch((host or "").strip().lower())
+        if match is None:
             return False
-        name = parts[1] or parts[2] or parts[3]
-        known_names = {"localhost", self.host.lower(), *(known.lower() for known in self.names)}
+        name = match[1] or match[2] or match[3]
+        known_names = {"localhost", self.host.lower(), *(known_name.lower() for known_name in self.names)}
         return name in known_names or _parse_address(name) is not None
 
     def _has_key(self, authorization: str | None) -> bool:
@@ -79,10 +79,10 @@ class Access:
 
 
 def read_key(path: Path) -> str:
-    """Return the key in a file, which is its first line.
+    """Return the key in the first line of a file.
 
     Raises:
-        InputError: The file cannot be read, or the key is short or not plain text.
+        InputError: The file cannot be read, or the key is too short or contains characters that are not allowed.
     """
     try:
         text = path.read_text(encoding="ascii")
@@ -108,7 +108,7 @@ def read_key(path: Path) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine can reach an address. `localhost` is the only name that is accepted."""
+    """Return whether only this machine can reach an address. Names except `localhost` return false."""
     address = _parse_address(host)
     return host == "localhost" or (address is not None and address.is_loopback)
 
@@ -128,7 +128,7 @@ def get_single_header(request: Any, name: str) -> str | None:
 
 @contextmanager
 def translate_listen_errors(access: Access, port: int) -> Iterator[None]:
-    """Convert an OSError within the context into an error that names the address.
+    """Convert an OSError in a `with` block into an error that contains the address.
 
     Raises:
         InputError: The server cannot listen on the address.

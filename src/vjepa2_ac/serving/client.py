@@ -8,8 +8,8 @@ from typing import Any
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
 from vjepa2_ac.serving.wire import MAX_MESSAGE_BYTES, pack, require_msgpack, unpack
 
-_METADATA_TIMEOUT_S = 30.0  # timeout for the metadata after connecting; a server only listens once its model is loaded
-_REPLY_TIMEOUT_S = 120.0  # default timeout for a reply
+_METADATA_TIMEOUT_S = 30.0  # timeout for the metadata after connecting; a server listens only after its model is loaded
+_REPLY_TIMEOUT_S = 120.0  # default
 
 
 class PlanningClient(ExitStack):
@@ -62,16 +62,16 @@ class PlanningClient(ExitStack):
         """
         try:
             self._connection.send(pack(request))
-            answer = self._connection.recv(timeout=self._timeout_s)
+            reply = self._connection.recv(timeout=self._timeout_s)
         except TimeoutError:
             self.close()
             problem, fix = f"no reply within {self._timeout_s:g} s", "Check the server's log and connect again"
             raise UnreachableError(where=self.url, found=problem, fix=fix) from None
         except Exception as error:
             raise UnreachableError(where=self.url, found=f"the connection was lost ({_reason(error)})") from None
-        if isinstance(answer, str):
-            raise InputError(where=self.url, found=answer)
-        return unpack(answer)
+        if isinstance(reply, str):
+            raise InputError(where=self.url, found=reply)
+        return unpack(reply)
 
 
 def _reason(error: Exception) -> str:

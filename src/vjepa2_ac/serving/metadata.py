@@ -17,10 +17,10 @@ from vjepa2_ac.planning.goals import GOALS_FILE, SubGoal, read_goal_folder
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.serving.session import Session
 
-PROTOCOL = 2  # incremented at changes that require changes of clients
+PROTOCOL = 2  # incremented when clients must change
 _MAX_NAMES = 60  # names of goals in the metadata
 _IMAGE_SIZE = 180, 320  # height and width of each view in the first decision
-_REACHABLE_POSE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])  # for the first decision
+_REACHABLE_POSE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])  # measured state of the first decision
 
 
 def make_metadata(loaded: Subject, session: Session) -> dict[str, Any]:
@@ -28,7 +28,7 @@ def make_metadata(loaded: Subject, session: Session) -> dict[str, Any]:
     planning, options, model = loaded.config.planning, session.options, loaded.as_dict()["model"]
     sections = (getattr(loaded.config.data, name) for name in loaded.config.data.format_sections())
     rates = (getattr(section, "control_rate_hz", None) for section in sections)
-    rate = next((rate for rate in rates if rate is not None), None)  # None: it is stored in the data set only
+    rate = next((rate for rate in rates if rate is not None), None)  # None: only the data set contains the rate
     return {
         "policy": "vjepa2-ac",
         "protocol": PROTOCOL,
@@ -52,7 +52,7 @@ def make_metadata(loaded: Subject, session: Session) -> dict[str, Any]:
 
 
 def get_action_space(session: Session) -> str:
-    """Return the name of the action space, as RoboArena calls it."""
+    """Return the name of the action space; for poses the name that RoboArena uses."""
     space = session.controller.spaces
     if session.options.actions == "pose":
         return "cartesian_position"
@@ -60,7 +60,7 @@ def get_action_space(session: Session) -> str:
 
 
 def describe_server(metadata: Mapping[str, Any], subject: str) -> str:
-    """Return a description of the server for its console."""
+    """Return the lines that the server prints about itself at the start."""
     limits = metadata["limits"]
     lines = [
         f"model: {subject}",
@@ -74,7 +74,7 @@ def describe_server(metadata: Mapping[str, Any], subject: str) -> str:
 
 
 def warm_up(controller: Controller) -> float:
-    """Make a decision with two noise images, which initialises libraries and caches; return its duration in seconds.
+    """Make a decision with noise images to initialise libraries and caches; return its duration in seconds.
 
     Raises:
         InputError: The model returns no finite energy.
@@ -102,8 +102,8 @@ _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg"}
 def read_named_goals(folder: Path) -> NamedGoals:
     """Read the named goals in a folder.
 
-    The folder contains goals.json, which makes it one sequence of goals; or it contains images and folders with a
-    goals.json. An image `cup.png` is a goal with the name `cup`. A sequence of goals has the name of its folder.
+    A folder with goals.json is one sequence of goals with the folder's name. In any other folder each image is a goal
+    (`cup.png` has the name `cup`), and each inner folder with goals.json is a sequence of goals.
 
     Raises:
         InputError: There is no goal, two goals have the same name, or a file cannot be read.

@@ -1,4 +1,4 @@
-"""Record every decision of a server as a line of JSON, with its images."""
+"""Record every decision of a server: one line of JSON, and its images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vjepa2_ac.storage.structured import format_json, to_plain, utc_now
 logger = logging.getLogger(__name__)
 
 SERVER_FILE, DECISIONS_FILE, IMAGES_FOLDER = "server.json", "decisions.jsonl", "images"
-FORMAT = 2  # incremented at changes that require changes of readers
+FORMAT = 2  # incremented when readers must change
 MAX_RECORDING_BYTES = 2 * 10**9  # default size limit of a recording
 
 
@@ -52,13 +52,13 @@ class Recorder:
         masks = () if mask is None else (np.repeat(np.uint8(255) * (mask > 0)[..., None], 3, axis=-1),)
         self._goals, self._episode = (*(goal.image for goal in goals), *masks), self._episode + 1
 
-    def write_decision(self, frame: np.ndarray, state: np.ndarray, answer: Mapping[str, Any]) -> None:
-        """Record a decision: the observation and the reply.
+    def write_decision(self, frame: np.ndarray, state: np.ndarray, reply: Mapping[str, Any]) -> None:
+        """Record the observation and the reply of a decision.
 
         Args:
             frame: The camera image.
             state: The measured state.
-            answer: The reply to the robot.
+            reply: The reply to the robot.
         """
         if not self._is_active:
             return
@@ -69,7 +69,7 @@ class Recorder:
                 "frame": self._write_image(frame),
                 "state": to_plain(state),
             }
-            line |= {"goals": [self._write_image(image) for image in self._goals], "answer": to_plain(answer)}
+            line |= {"goals": [self._write_image(image) for image in self._goals], "answer": to_plain(reply)}
             text = json.dumps(line, allow_nan=False) + "\n"
             self._reserve_bytes(len(text.encode()))
             with (self.folder / DECISIONS_FILE).open("a") as file:

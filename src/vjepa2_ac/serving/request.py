@@ -1,4 +1,4 @@
-"""Parse a client's message, in any of the formats of openpi's clients, into one record."""
+"""Parse a message in any of the formats of openpi's clients."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MAX_CHUNKS, MAX_CHUNK_STEPS = 1024, 256  # action chunks of one request, and con
 
 @dataclass(frozen=True)
 class GoalRule:
-    """The rule of one goal image, as in goals.json; all fields are optional."""
+    """When a goal image applies, and its gripper mode, as in goals.json; all fields are optional."""
 
     name: str = ""
     at_least: _Steps = 1
@@ -53,7 +53,7 @@ class GoalRequest:
 
     @property
     def fingerprint(self) -> str:
-        """A hash of the name, or of images, rules and mask. A client may send the same goal with every request."""
+        """Hash of the name, or of images, rules and mask; the same for a goal that is sent with every request."""
         digest = hashlib.sha256(repr(self.name).encode())
         for goal in self.goals:
             digest.update(repr((goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper)).encode())
@@ -67,13 +67,13 @@ class GoalRequest:
 class Request:
     """One message of a client."""
 
-    episode: str | None = None  # the message's session_id; a new one starts an episode
+    episode: str | None = None  # session_id of the message; a new value starts an episode
     is_new_episode: bool = False  # whether the message starts an episode (reset)
     goal: GoalRequest | None = None  # None: the previous goal
-    frame: UInt8[np.ndarray, "height width 3"] | None = None  # None: a reset, which requests no action
-    state: Float[np.ndarray, " dim"] | None = None  # None: a reset
+    frame: UInt8[np.ndarray, "height width 3"] | None = None  # None for the endpoint reset, which returns no action
+    state: Float[np.ndarray, " dim"] | None = None  # None for the endpoint reset
     chunks: Float[np.ndarray, "chunks steps dim"] | None = None  # action chunks of a policy, at control rate
-    form: ChunkForm = "targets"  # meaning of the numbers in chunks
+    form: ChunkForm = "targets"  # meaning of the numbers in `chunks`
     is_score: bool = False  # whether to score the chunks; otherwise a search starts from them
 
 
@@ -148,7 +148,7 @@ def _parse_numbers(value: Any, where: str) -> np.ndarray:
 
 
 def _parse_goal(message: Mapping[str, Any]) -> GoalRequest | None:
-    """Return the goal of a request; without goal keys the prompt is the name of the goal."""
+    """Return the goal of a request; without keys that start with goal/, the prompt is the name of the goal."""
     goal_keys = sorted(key for key in message if key.startswith(_GOAL_PREFIX))
     for key in goal_keys:
         if key not in {*_GOAL_KEYS, *_GOAL_OPTIONS}:

@@ -24,9 +24,9 @@ from vjepa2_ac.serving.access import (
 from vjepa2_ac.serving.session import ClientDisconnectedError, Session
 from vjepa2_ac.serving.wire import MAX_MESSAGE_BYTES, pack
 
-_HANDSHAKE_TIMEOUT_S = 10.0  # timeout of a handshake
-_PING_INTERVAL_S = 20.0  # interval of pings, and the timeout of their replies
-_MAX_QUEUED_MESSAGES = 2  # messages of a client that are received before the previous ones are answered
+_HANDSHAKE_TIMEOUT_S = 10.0
+_PING_INTERVAL_S = 20.0  # interval of pings, and timeout of the pongs
+_MAX_QUEUED_MESSAGES = 2  # received messages that wait for the reply to a previous message
 
 Load = Callable[[], tuple[Session, Mapping[str, Any]]]
 """Loads the model and makes a first decision; returns the session, and the metadata that is sent on connect."""
@@ -56,7 +56,7 @@ class PlanningServer:
             stop: Ends the server.
 
         Returns:
-            Whether the planning thread has ended, too.
+            Whether the planning thread has ended.
 
         Raises:
             InputError: The model cannot be loaded, or the server cannot listen on the address.
@@ -80,7 +80,7 @@ class PlanningServer:
         loading = asyncio.wrap_future(self._planning.submit(load))
         stopping = asyncio.ensure_future(stop.wait())
         try:
-            await _first_of(loading, stopping)
+            await _wait_for_first(loading, stopping)
             if not stop.is_set():
                 self._session, self._metadata = loading.result()
                 with translate_listen_errors(self._access, self._port):  # another program may listen on the port by now
@@ -89,7 +89,7 @@ class PlanningServer:
                 await stopping
         finally:
             server.close()  # disconnects the clients, which cancels their searches
-            pending_work = asyncio.wrap_future(self._planning.submit(int))
+            pending_work = asyncio.wrap_future(self._planning.submit(int))  # ends after all earlier work
             self._planning.shutdown(wait=False)
             has_ended = await wait_for_shutdown(server.wait_closed(), pending_work)
         return has_ended
@@ -134,26 +134,26 @@ class PlanningServer:
                 async for message in connection:
                     if isinstance(message, str):
                         await connection.send("received a text message. Expected a binary message in msgpack")
-                    elif (answer := await self._answer(message, disconnected)) is not None:
-                        await connection.send(answer)
+                    elif (reply := await self._reply_to(message, disconnected)) is not None:
+                        await connection.send(reply)
             self._print_status(f"robot disconnected: {self._robot}")
         finally:
             self._robot = None
             disconnected.cancel()
 
-    async def _answer(self, message: bytes, disconnected: asyncio.Future[None]) -> bytes | str | None:
+    async def _reply_to(self, message: bytes, disconnected: asyncio.Future[None]) -> bytes | str | None:
         """Return the reply to a message; None if the robot has disconnected, which cancels its search."""
         is_disconnected = threading.Event()
-        answering = asyncio.wrap_future(
-            self._planning.submit(lambda: self._session.answer(message, is_disconnected.is_set))
+        reply = asyncio.wrap_future(
+            self._planning.submit(lambda: self._session.reply_to(message, is_disconnected.is_set))
         )
         try:
-            await _first_of(answering, disconnected)
+            await _wait_for_first(reply, disconnected)
         finally:
-            if not answering.done():
+            if not reply.done():
                 is_disconnected.set()
         try:
-            return await answering
+            return await reply
         except ClientDisconnectedError:
             return None
 
@@ -176,7 +176,7 @@ class PlanningServer:
 
 
 def serve(load: Load, access: Access, port: int, print_status: Callable[[str], None]) -> bool:
-    """Run a planning server until SIGTERM or SIGINT; return whether the planning thread has ended, too.
+    """Run a planning server until SIGTERM or SIGINT; return whether the planning thread has ended.
 
     Raises:
         InputError: As for `PlanningServer.run`.
@@ -184,7 +184,7 @@ def serve(load: Load, access: Access, port: int, print_status: Callable[[str], N
     return run_until_signal(partial(PlanningServer(access, port, print_status).run, load))
 
 
-async def _first_of(*futures: asyncio.Future[Any]) -> None:
+async def _wait_for_first(*futures: asyncio.Future[Any]) -> None:
     await asyncio.wait(futures, return_when=asyncio.FIRST_COMPLETED)
 
 

@@ -1,8 +1,8 @@
-"""Answer the requests of one robot with a controller. This module does not use the network.
+"""Reply to the requests of one robot with the decisions of a controller. This module does not use the network.
 
-On any error the robot does not move. An invalid request is answered with a sentence, which openpi's clients raise as an
-error. A decision without a plan is answered with the zero action. No action is sent twice, and each planned action is
-checked against the limits once more, independently of the planner.
+On any error the robot does not move. The reply to an invalid request is a sentence, which openpi's clients raise as an
+error. Without a plan the reply contains the zero action. No action is sent twice, and the limits of each planned action
+are checked once more, independently of the planner.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Clock = Callable[[], float]  # seconds since an arbitrary time
 _MAX_NAMES = 20  # names of goals in an error message
 DEADLINE_EXCEEDED = "past the deadline"
 _ALARM = "the camera image differs from the predicted frame; check the robot"
-_BAR_HEIGHT = 0.05  # share of the height; an image that is black at top and bottom over this share is padded
+_BAR_HEIGHT = 0.05  # smallest height of a black bar, as a fraction of the image's height
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class SessionOptions:
     actions: ActionForm = "delta"
     control_steps: int = 4  # control steps per model step; with `actions="pose"` the number of waypoints per reply
     image_keys: tuple[str, ...] = IMAGE_KEYS
-    deadline_s: float = 60.0  # for a decision, including the encoding of its goal; afterwards the action is zero
+    deadline_s: float = 60.0  # for a decision, including the encoding of its goal; a late decision is a zero action
     dry_run: bool = False  # whether to plan but send the zero action
-    is_blind: bool = False  # whether the model ranks actions at chance level; scores then name no best chunk
+    is_blind: bool = False  # whether the model ranks actions at chance level; `best` of scores is then None
 
 
 @dataclass
 class Counts:
-    """Counters of a session, for the metrics page of the server."""
+    """Counters of a session, for the URL /metrics."""
 
     decisions: Counter[str] = field(default_factory=Counter)  # number of decisions by reason
     rejected: int = 0  # invalid requests
@@ -69,11 +69,11 @@ class Counts:
 
 
 class ClientDisconnectedError(Exception):
-    """The client has disconnected, so that no reply is needed."""
+    """The client has disconnected, so no reply is needed."""
 
 
 class Session:
-    """Answers the requests of one robot at a time.
+    """Replies to the requests of one robot at a time.
 
     Raises:
         InputError: `actions` is "pose", but the model's states are not poses.
@@ -86,7 +86,7 @@ class Session:
         options: SessionOptions | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
-        """Create a session without a robot.
+        """Create a session.
 
         Args:
             controller: Plans the actions.
@@ -100,11 +100,11 @@ class Session:
         self.recorder: Recorder | None = None  # records every decision
         self._clock = clock
         self._episode: str | None = None
-        self._has_episode = False  # whether this robot has started an episode
+        self._has_episode = False  # whether the current robot has started an episode
         self._goal: str | None = None  # fingerprint of the current goal
-        self._names: tuple[str, ...] = ()  # names of its sub-goals
+        self._sub_goal_names: tuple[str, ...] = ()  # of the current goal
         self._notes: list[str] = []  # notes for the client in this episode
-        self._last_ms: float | None = None
+        self._last_ms: float | None = None  # duration of the previous request
         if self.options.actions == "pose" and not controller.spaces.state.is_pose:
             problem = "the states of the model are not poses"
             raise InputError(
@@ -115,7 +115,7 @@ class Session:
         """Reset the state of the session for another robot."""
         self._episode, self._has_episode, self._last_ms = None, False, None
 
-    def answer(self, message: bytes, is_disconnected: Callable[[], bool] = lambda: False) -> bytes | str:
+    def reply_to(self, message: bytes, is_disconnected: Callable[[], bool] = lambda: False) -> bytes | str:
         """Return the reply to a message: an encoded map, or the text of an error.
 
         Args:
@@ -165,13 +165,13 @@ class Session:
             SearchCancelledError: The search was cancelled.
         """
         if request.goal is not None and (fingerprint := request.goal.fingerprint) != self._goal:
-            self._goal, self._notes = None, []  # after an invalid goal there is no goal
+            self._goal, self._notes = None, []  # in case that the new goal is invalid
             self._set_goal(request.goal, cancelled)
             self._goal = fingerprint
         if request.frame is None or request.state is None:
             return {"status": "reset"}
         if self._goal is None:
-            needed = f"goal/image, goal/images or goal/name{self._format_known_goals()}"
+            needed = f"goal/image, goal/images or goal/name{self._list_goal_names()}"
             raise InputError(where="request", found="no goal was set in this episode", needed=needed)
         changes, planning_start = self._convert_chunks(request), self._clock()
         observation = request.frame, request.state
@@ -180,7 +180,7 @@ class Session:
             return {**scores.as_dict(is_blind=self.options.is_blind), "goal": scores.goal}
         self.controller.act(*observation, samples=changes, cancelled=cancelled)
         decision, why = self._check_limits(request.state)
-        self._check_frame(request.frame)
+        self._warn_about_padding(request.frame)
         self._count_surprise(decision)
         return self._make_reply(*observation, (decision, why), (start_time, planning_start))
 
@@ -217,7 +217,7 @@ class Session:
         return reply
 
     def _check_limits(self, state: np.ndarray) -> tuple[Decision, str]:
-        """Return the decision and its reason. The plan is removed if it violates the limits."""
+        """Return the decision of the controller and its reason, without the plan if it violates the limits."""
         decision, controller = self.controller.decision, self.controller
         if decision is None:
             raise ValueError("the controller has no decision after `act`")
@@ -231,11 +231,9 @@ class Session:
         return replace(decision, plan=None, states=None), f"not sent: {reason}"
 
     def _format_decision(self, decision: Decision | None, state: np.ndarray, why: str) -> dict[str, Any]:
-        """Return the reply for a decision.
+        """Return the reply for a decision. Without a decision, or if it has no plan, the action is zero.
 
         Only values with one row per action are arrays, because clients take one row of every array.
-
-        Without a decision, or without a plan in it, the action is zero.
         """
         planned, changes = np.atleast_2d(state), np.zeros((self.controller.space.steps, self.controller.space.dim))
         reply: dict[str, Any] = {
@@ -244,7 +242,7 @@ class Session:
         }  # fmt: skip
         if decision is not None:
             progress, plan = decision.progress, decision.plan
-            name = self._names[progress.goal_index]
+            name = self._sub_goal_names[progress.goal_index]
             goal = {
                 "index": progress.goal_index,
                 "name": name,
@@ -266,10 +264,10 @@ class Session:
     def _format_actions(
         self, state: np.ndarray, changes: Float[np.ndarray, "steps dim"]
     ) -> Float[np.ndarray, "rows dim"]:
-        """Convert the changes of the plan into the format of the reply.
+        """Convert the changes of a plan into the actions of the reply.
 
-        With `actions="pose"` these are waypoints to the first target. Otherwise they are one row per model step: target
-        states if the recorded actions are absolute targets, else changes.
+        With `actions="pose"` the actions are waypoints to the first target. Otherwise there is one action per model
+        step: the target state if the model was trained on recorded targets, else the change.
         """
         if self.options.actions == "pose":
             return interpolate_waypoints(state, changes[0], self.options.control_steps)
@@ -279,15 +277,15 @@ class Session:
 
     def _set_goal(self, goal: GoalRequest, cancelled: Cancelled) -> None:
         if goal.name is not None and goal.name not in self.goals:
-            needed = f"the name of a goal{self._format_known_goals()}"
+            needed = f"the name of a goal{self._list_goal_names()}"
             raise InputError(where="goal", found=f"unknown goal {goal.name!r}", needed=needed)
         goals = goal.goals if goal.name is None else self.goals[goal.name]
         self.controller.follow(goals, mask=goal.mask, cancelled=cancelled)
-        self._names = tuple(sub_goal.name for sub_goal in goals)
+        self._sub_goal_names = tuple(sub_goal.name for sub_goal in goals)
         if self.recorder is not None:
             self.recorder.set_goals(goals, goal.mask)
 
-    def _format_known_goals(self) -> str:
+    def _list_goal_names(self) -> str:
         names = list(self.goals)
         more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
         return f" (this server has {', '.join(names[:_MAX_NAMES])}{more})" if names else ""
@@ -299,8 +297,8 @@ class Session:
             if surprise.is_alarm:
                 logger.warning("surprise %.4g: %s", surprise.score, _ALARM)
 
-    def _check_frame(self, frame: np.ndarray) -> None:
-        text = "black bars at the top and bottom of the image; send whole frames without padding"
+    def _warn_about_padding(self, frame: np.ndarray) -> None:
+        text = "black bars at the top and bottom of the image; send images without padding"
         if has_black_bars(frame) and text not in self._notes:
             self._notes.append(text)
             logger.warning(text)
@@ -315,27 +313,27 @@ def has_black_bars(frame: np.ndarray) -> bool:
 def interpolate_waypoints(
     state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"], steps: int
 ) -> Float[np.ndarray, "steps 7"]:
-    """Return evenly spaced poses from a state to its target, which is the last one.
+    """Return evenly spaced poses between a state and its target; the last pose is the target.
 
     A pose is x, y, z in metres, extrinsic xyz angles in radians, and closedness from 0 to 1. The position moves along a
-    straight line; the rotation is about one axis with constant speed (R_delta^share @ R).
+    straight line. The rotation is about one axis with constant speed.
 
     Args:
         state: The measured pose.
         action: The change of the pose in one model step.
         steps: Control steps per model step.
     """
-    shares = np.arange(1, steps + 1)[:, None] / steps
+    fractions = np.arange(1, steps + 1)[:, None] / steps
     turn = Rotation.from_matrix(matrices_from_euler(action[3:6])).as_rotvec()
-    turns = Rotation.from_rotvec(shares * turn).as_matrix()
-    positions, gripper = (state[part] + shares * action[part] for part in (slice(0, 3), slice(6, 7)))
+    turns = Rotation.from_rotvec(fractions * turn).as_matrix()
+    positions, gripper = (state[part] + fractions * action[part] for part in (slice(0, 3), slice(6, 7)))
     poses = np.concatenate([positions, euler_from_matrices(turns @ matrices_from_euler(state[3:6])), gripper], axis=1)
     poses[-1] = apply_action(state, action)  # bit-identical to the target of the plan
     poses[:, 6] = poses[:, 6].clip(0.0, 1.0)
     return poses
 
 
-_ROUNDING = 1e-6  # tolerance, because the search uses float32 limits
+_ROUNDING = 1e-6  # tolerance for the float32 rounding of planned actions
 
 
 def find_limit_violation(
@@ -358,7 +356,7 @@ def find_limit_violation(
         return "a translation exceeds planning.limits.xyz or l1"
     if (abs(changes[:, 3:6]) > min(limits.rotation + _ROUNDING, math.pi)).any():
         return "a rotation exceeds planning.limits.rotation"
-    if abs(changes[:, 6]).max() > 1.0:  # opening and closing are changes of 1, independently of the limit
+    if abs(changes[:, 6]).max() > 1.0:  # the gripper modes open and close use 1, independently of the limit
         return "a gripper change exceeds 1"
     box, targets = Workspace.from_limits(limits, space), state[:3] + np.cumsum(changes[:, :3], axis=0)
     is_out = box is not None and changes[:, :3].any() and (abs(box.get_return_motion(targets)) > _ROUNDING).any()

@@ -1,7 +1,7 @@
 """The wire format: msgpack maps with NumPy arrays, as openpi's clients write and read them.
 
-Received messages are not trusted. Their types, lengths, depth and number of parts are checked before memory is
-allocated. Arrays must have one of a few plain types, and exactly the bytes of their shape.
+Received messages are not trusted. Types, lengths, depth and number of parts are checked before memory is allocated. An
+array must have one of a few plain types, and exactly the number of bytes for its shape.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAX_PARTS = 256  # maps, lists and arrays in a message
 MAX_ENTRIES = 64  # entries of a map or list
 MAX_CHARACTERS = 4096  # characters of a text
 MAX_DEPTH = 6  # nesting of maps and lists
-MAX_AXES = 4  # dimensions of an array
+MAX_DIMENSIONS = 4  # of an array
 
 _ARRAY, _SCALAR, _DATA, _DTYPE, _SHAPE = b"__ndarray__", b"__npgeneric__", b"data", b"dtype", b"shape"
 _TYPES = frozenset({"|b1", "|u1", "|i1", "<u2", "<u4", "<u8", "<i2", "<i4", "<i8", "<f2", "<f4", "<f8"})
@@ -27,14 +27,14 @@ _ITEM_BYTES = {kind: int(kind[2:]) for kind in _TYPES}
 
 
 class WireError(ValueError):
-    """A message that violates the protocol. The text is a sentence for the sender."""
+    """A message violates the protocol. The text of the error is sent to the client."""
 
 
 def unpack(message: bytes) -> dict[str, Any]:
     """Decode a message into a map of texts, numbers, booleans, None, bytes, lists, maps, and writable NumPy arrays.
 
     Raises:
-        WireError: The message is no msgpack map with text keys, or contains other types or too large values.
+        WireError: The message is not a msgpack map with text keys, a value has another type, or a limit is exceeded.
     """
     if len(message) > MAX_MESSAGE_BYTES:
         raise WireError(f"the message has {len(message):,} bytes. Expected at most {MAX_MESSAGE_BYTES:,}")
@@ -70,10 +70,10 @@ def pack(message: Mapping[str, Any]) -> bytes:
 
 
 def require_msgpack(where: str = "msgpack") -> Any:
-    """Import msgpack, which only the wire format needs.
+    """Import msgpack, which is an optional dependency.
 
     Raises:
-        UnreachableError: It is not installed.
+        UnreachableError: msgpack is not installed.
     """
     return require_library("msgpack", where=where, called="msgpack", extra="serve")
 
@@ -81,7 +81,7 @@ def require_msgpack(where: str = "msgpack") -> Any:
 class _Parts:
     """Hooks for msgpack that create the maps, lists and arrays of a message and limit their number.
 
-    msgpack calls the hooks for the innermost maps and lists first.
+    msgpack calls the hooks for inner maps and lists before those for outer ones.
     """
 
     def __init__(self) -> None:
@@ -115,9 +115,9 @@ def _decode_array(entries: dict[Any, Any]) -> np.ndarray:
     if entries.keys() != {_ARRAY, _DATA, _DTYPE, _SHAPE} or entries[_ARRAY] is not True:
         raise WireError("an array must have exactly the entries `data`, `dtype` and `shape`")
     dtype, shape, data = _check_dtype(entries[_DTYPE]), entries[_SHAPE], entries[_DATA]
-    is_shape = isinstance(shape, list) and len(shape) <= MAX_AXES
+    is_shape = isinstance(shape, list) and len(shape) <= MAX_DIMENSIONS
     if not is_shape or not all(type(side) is int and 0 <= side <= MAX_MESSAGE_BYTES for side in shape):
-        raise WireError(f"the shape of an array must be a list of up to {MAX_AXES} non-negative integers")
+        raise WireError(f"the shape of an array must be a list of up to {MAX_DIMENSIONS} non-negative integers")
     if not isinstance(data, bytes) or math.prod(shape) * _ITEM_BYTES[dtype] != len(data):
         raise WireError(f"the bytes of an array do not match its shape and its type {dtype}")
     if dtype == "|b1":  # NumPy requires the bytes 0 and 1; any byte except 0 means true
@@ -142,10 +142,10 @@ def _check_dtype(dtype: Any) -> str:
 
 
 def _require_plain(value: Any, depth: int) -> None:
-    """Check that a value contains only types of the protocol.
+    """Refuse a value with types that are not part of the protocol.
 
     Raises:
-        WireError: It contains another type, or more than `depth` nested maps and lists.
+        WireError: A type is not part of the protocol, or there are more than `depth` nested maps and lists.
     """
     if isinstance(value, dict | list):
         if not depth:

@@ -1,6 +1,6 @@
 """Seekable remote files, fetched block by block on demand, and the local disk cache of remote bytes.
 
-`DiskCache` holds the blocks of these files, and also whole files and parts of them. No block is fetched twice.
+`DiskCache` stores blocks of these files, and other remote bytes. No block is fetched twice.
 """
 
 from __future__ import annotations
@@ -25,24 +25,26 @@ from vjepa2_ac.storage import remote
 logger = logging.getLogger(__name__)
 
 BLOCK_BYTES = 128 << 10
-_READ_AHEAD_BLOCKS = 32  # upper limit for sequential reads
-_CACHED_BLOCKS = 128
+_READ_AHEAD_BLOCKS = 32  # largest number of blocks of a sequential read
+_CACHED_BLOCKS = 128  # blocks of a file in memory
 
-_EVICTION_TARGET = 0.8  # an eviction reduces the folder to this share of the limit, so that folder scans are rare
+_EVICTION_TARGET = (
+    0.8  # an eviction reduces the folder to this fraction of the limit, so that scans of the folder are rare
+)
 _CRC_BYTES = 4  # appended to the data of an entry
 _TOTAL_BYTES = 8  # length of the total size stored in the file `lock`
 _PART = struct.Struct(">QQI")  # start, size and CRC of a part of an entry
 
 
 class RangedFile(io.RawIOBase):
-    """A seekable file that is fetched in blocks; the last 16 MB read are cached in memory.
+    """A seekable file that is fetched in blocks; the last 16 MB that were read are cached in memory.
 
-    A seek costs one block of 128 KB. Each sequential read fetches twice as much as the previous one, up to 4 MB. So
-    reading a video's header or one group of its frames fetches few extra bytes, and a whole file needs few requests.
+    A read after a seek fetches one block of 128 KB. Each sequential read fetches twice as much as the previous one, up
+    to 4 MB. So the header of a video needs few bytes, and a whole file needs few requests.
 
     Args:
-        fetch: Returns exactly `length` bytes from `start`. It is called with (start, length) of whole blocks.
-        size: Size of the file.
+        fetch: Returns the bytes for (start, length). The range is always a number of whole blocks.
+        size: Size of the file in bytes.
     """
 
     def __init__(self, fetch: Callable[[int, int], bytes], size: int) -> None:
@@ -80,11 +82,11 @@ class RangedFile(io.RawIOBase):
         if start >= end:
             return b""
         first, last = start // BLOCK_BYTES, (end - 1) // BLOCK_BYTES
-        pieces: dict[int, bytes] = {}
+        blocks: dict[int, bytes] = {}
         for number in range(first, last + 1):
-            if number not in pieces:
-                pieces |= self._load(number, last)
-        data = b"".join(pieces[number] for number in range(first, last + 1))
+            if number not in blocks:
+                blocks |= self._load(number, last)
+        data = b"".join(blocks[number] for number in range(first, last + 1))
         return data[start - first * BLOCK_BYTES : end - first * BLOCK_BYTES]
 
     def _load(self, number: int, last: int) -> dict[int, bytes]:
@@ -108,15 +110,15 @@ class RangedFile(io.RawIOBase):
 class DiskCache:
     """A key-value store of bytes in a local folder; at the size limit the least recently used entries are evicted.
 
-    Any number of threads and processes may use one folder. The file `lock` holds the total size of its entries. A
+    Any number of threads and processes may use one folder. The file `lock` contains the total size of the entries. A
     writer adds the size of its entry to the total before it stores the entry. If the total would exceed the limit, the
     writer first scans the folder and evicts entries down to 80 % of the limit, while other writers wait. So the folder
     exceeds the limit by at most one entry for each thread that was storing an entry during the last scan.
 
-    If the folder cannot be used, all entries count as absent, which causes a warning and never an error.
+    If the folder cannot be used, a warning is logged and all entries count as absent.
 
     Args:
-        folder: Created with the first entry.
+        folder: The folder, which is created with the first entry.
         limit_bytes: Total size of all entries, in bytes. An entry larger than 80 % of the limit is not stored. With 0
             no entry is stored or evicted. None: no limit.
     """
@@ -139,7 +141,7 @@ class DiskCache:
         return data if crc == _crc(data) else None
 
     def write(self, key: str, data: bytes) -> None:
-        """Store bytes under a key, replacing an old entry; a warning is logged if that is not possible."""
+        """Store bytes under a key, replacing an old entry; log a warning if that is not possible."""
         path, content = self._path(key), data + _crc(data)
         if path in self._refused or (self._limit is not None and len(content) > self._limit * _EVICTION_TARGET):
             return
@@ -171,7 +173,7 @@ class DiskCache:
         self.write(key, b"".join([*table, *parts]))
 
     def read_parts(self, key: str, count: int, numbers: Sequence[int]) -> list[bytes] | None:
-        """Return the parts `numbers` of an entry of `count` parts, reading only these; None if absent or damaged."""
+        """Read and return the parts `numbers` of an entry with `count` parts; None if the entry is absent or damaged."""
         path = self._path(key)
         try:
             with path.open("rb", buffering=0) as file:
@@ -187,11 +189,11 @@ class DiskCache:
         return parts if [zlib.crc32(part) for part in parts] == [table[number][2] for number in numbers] else None
 
     def _note_refusal(self, path: Path, error: OSError) -> None:
-        """Log one warning per cache; an existing entry that the system refuses to read or write is not replaced."""
+        """Log one warning per cache, and do not write an entry again that could not be read or written."""
         if isinstance(error, FileNotFoundError):
             return
         if not self._refused:
-            text = "%s: the disk cache cannot be used (%s). Its data are fetched again"
+            text = "%s: the disk cache cannot be used (%s). The data are fetched again"
             logger.warning(text, error.filename or self._folder, describe_refusal(error)[0])
         self._refused.add(path)
 
@@ -200,21 +202,21 @@ class DiskCache:
         return self._folder / name[:2] / name[2:]
 
     def _reserve(self, size: int) -> None:
-        """Add the size of an entry to the total size of the folder, evicting other entries first if it does not fit."""
+        """Add the size of an entry to the total size of the folder; evict other entries first if it does not fit."""
         if not self._limit:
             return
         with os.fdopen(os.open(self._folder / "lock", os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0) as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             try:
                 total = int.from_bytes(lock.read(_TOTAL_BYTES), "big")
-                if total == 0 or total + size > self._limit:  # 0: a new file, or a file emptied by a power cut
+                if total == 0 or total + size > self._limit:  # 0: the file is new, or a power failure emptied it
                     total = self._evict(size, self._limit)
                 os.pwrite(lock.fileno(), (total + size).to_bytes(_TOTAL_BYTES, "big"), 0)
             finally:
-                fcntl.flock(lock, fcntl.LOCK_UN)  # closing is not enough: a process forked meanwhile has the file open
+                fcntl.flock(lock, fcntl.LOCK_UN)  # closing is not enough if a process was forked meanwhile
 
     def _evict(self, size: int, limit: int) -> int:
-        """Evict the least recently used entries if `size` more bytes do not fit; return the total size of the rest."""
+        """Evict the least recently used entries if `size` more bytes do not fit; return the remaining total size."""
         entries = sorted(self._entries())
         total = sum(entry_size for _, entry_size, _ in entries)
         if total + size <= limit:
@@ -242,13 +244,13 @@ def _crc(data: bytes) -> bytes:
 class BlockCachedFile(RangedFile):
     """A seekable file behind a URL; each block is fetched once per machine.
 
-    The error of a failed fetch is stored in `failure`: libraries that read through this object may wrap the error in
-    one of their own types.
+    The error of a failed fetch is stored in `failure`, because a library that reads this file may raise an error of
+    another type instead.
 
     Args:
         path: The URL.
-        version: Changes with the content; blocks of another version are not used.
-        size: The file's size.
+        version: Version of the content; blocks of other versions are not used.
+        size: Size of the file in bytes.
         cache: The local cache of blocks.
     """
 
@@ -272,26 +274,26 @@ class BlockCachedFile(RangedFile):
 
 
 def cached_ranges(url: str, ranges: Sequence[tuple[int, int]], *, key: str, cache: DiskCache) -> list[bytes]:
-    """Return several (start, length) pieces of a file behind a URL, each complete, using the disk cache.
+    """Return several (start, length) ranges of a file behind a URL, each complete, using the disk cache.
 
-    Missing pieces are fetched concurrently; adjacent pieces are fetched in one request.
+    Missing ranges are fetched concurrently; adjacent ranges are fetched in one request.
 
     Args:
         url: The file.
         ranges: Non-empty (start, length) ranges.
         key: Identifies the content of the file.
-        cache: Stores each piece as a separate entry.
+        cache: The cache, in which each range is a separate entry.
 
     Raises:
-        OSError: There is no such file, or it ends within a piece.
+        OSError: There is no such file, or it ends within a range.
         UnreachableError: The file cannot be reached.
     """
-    pieces = {byte_range: cache.read(f"{key} {byte_range}") or b"" for byte_range in ranges}
-    missing = sorted(byte_range for byte_range, data in pieces.items() if len(data) != byte_range[1])
+    contents = {byte_range: cache.read(f"{key} {byte_range}") or b"" for byte_range in ranges}
+    missing = sorted(byte_range for byte_range, data in contents.items() if len(data) != byte_range[1])
     for byte_range, data in zip(missing, remote.read_adjacent_ranges(url, missing), strict=True):
-        pieces[byte_range] = data
+        contents[byte_range] = data
         cache.write(f"{key} {byte_range}", data)
-    return [pieces[byte_range] for byte_range in ranges]
+    return [contents[byte_range] for byte_range in ranges]
 
 
 def open_remote(url: str) -> RangedFile:

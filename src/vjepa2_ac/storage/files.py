@@ -1,11 +1,11 @@
 """Files on this machine and behind URLs: find, read and hash them; write local files atomically.
 
 A path is local, or a URL such as `gs://bucket/folder` (see `remote`). A missing or truncated file raises an
-`InputError`, which the handlers of broken episodes catch. Network failures are retried and finally raise an
-`UnreachableError`, as do errors of the operating system (see `read_error`): neither says that the file is broken.
+`InputError`, so an episode with such a file counts as broken. Network failures are retried and finally raise an
+`UnreachableError`, as do errors of the operating system (see `read_error`); the file itself may be intact.
 
 A file is written under a temporary name, `.NAME.RANDOM.partial` in the target folder, and renamed when it is complete
-and on the disk. Partial files of killed writers are removed by a later writer once they are unchanged for a day.
+and on the disk. A later writer removes partial files of killed writers after one day.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _WRITE_ERRNOS = (
     | {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.EINVAL, errno.ELOOP}
 )
 _PARTIAL = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
-_NAME_BYTES = 200  # leaves space for the suffix of a temporary name: file systems allow 255
+_NAME_BYTES = 200  # leaves space for the suffix of a temporary name; most file systems allow 255 bytes
 _ABANDONED_AFTER_S = 86_400.0
 _POINTER_BYTES = 1024  # git-lfs pointers are smaller
 
@@ -60,9 +60,9 @@ def join(folder: str | Path, name: str) -> str:
 
 
 def canonical_path(path: str | Path) -> str:
-    """Return the canonical form of a path or URL: local paths (also `file://`) absolute with links resolved.
+    """Return the canonical form of a path or URL, without a trailing slash.
 
-    The result does not depend on the working directory and has no trailing slash.
+    A local path or a `file://` URL becomes an absolute path in which symbolic links are resolved.
     """
     local = str(path).removeprefix("file://")
     return local.rstrip("/") if is_url(local) else str(Path(local).resolve())
@@ -114,25 +114,25 @@ def list_folder(folder: str | Path) -> list[FileInfo]:
 
 
 def list_files(folder: str | Path) -> list[FileInfo]:
-    """Return the files of `list_folder`."""
+    """Return the files in a folder, as `list_folder` does."""
     return [file for file in list_folder(folder) if file.is_file]
 
 
 def list_names(folder: str | Path) -> list[str]:
-    """Return the names of `list_folder`."""
+    """Return the names of the files and folders in a folder, sorted."""
     return [entry.name for entry in list_folder(folder)]
 
 
 def require_regular_file(path: str | Path, size: int | None = None) -> None:
-    """Refuse a git-lfs pointer, a pipe or a device in place of a file; only the beginning of a small file is read.
+    """Refuse a git-lfs pointer, a pipe or a device in place of a file. Only small files are read.
 
     Args:
         path: The file, which may be missing.
-        size: The file's size from a listing; None: it is looked up on this machine. A pointer behind a URL is refused
-            anyway as soon as its beginning is read.
+        size: The file's size in bytes, if known. Without it only local files are checked; a pointer behind a URL is
+            refused when its first bytes are read.
 
     Raises:
-        InputError: The file is a pointer; or a pipe or a device, which may never end.
+        InputError: The file is a pointer, a pipe or a device.
         UnreachableError: The file is at a URL and cannot be read.
     """
     with suppress(OSError):  # the caller reports a file that cannot be read
@@ -149,7 +149,7 @@ def require_regular_file(path: str | Path, size: int | None = None) -> None:
 def open_for_reading(path: str | Path) -> ByteReader:
     """Open a file for reading and seeking; the caller closes it.
 
-    Behind a URL only the blocks that are read are fetched, so the result suits readers of videos and tables.
+    Behind a URL only the blocks that are read are fetched.
 
     Raises:
         InputError: The file is a git-lfs pointer, a pipe or a device.
@@ -162,19 +162,20 @@ def open_for_reading(path: str | Path) -> ByteReader:
 def read_error(where: str, error: OSError, *, needed: str = "", fix: str = "") -> UserError:
     """Return the error of a file that is missing, truncated, or refused by the operating system.
 
-    A missing file is a MissingFileError, a truncated one an InputError. A refusal (no permission, too many open files,
-    a disconnected disk) says nothing about the file's content: it is an UnreachableError, which is never stored and
-    never a reason to remove or replace the file. Missing permission is a RefusedError, with the mode and the owner.
+    A missing file is a MissingFileError, a truncated one an InputError. After a refusal (no
+    permission, too many open files, a disconnected disk) the file may be intact. The error is then an UnreachableError,
+    for which a file is never removed, replaced or recorded as broken. Missing permission is a RefusedError, with the
+    mode and the owner of the file.
 
     Args:
-        where: The file, and its episode.
+        where: The file and its episode, for messages.
         error: The system's error.
         needed: The expected kind of file.
         fix: How to fix a missing or truncated file.
     """
     if isinstance(error, FileNotFoundError | NotADirectoryError):  # for a URL the error has no errno
-        absent = os.strerror(errno.ENOENT)
-        return MissingFileError(where=where, found=f"cannot be read: {absent}", needed=needed, fix=fix)
+        reason = os.strerror(errno.ENOENT)
+        return MissingFileError(where=where, found=f"cannot be read: {reason}", needed=needed, fix=fix)
     problem = f"cannot be read: {error.strerror or error}"
     if isinstance(error, ShortReadError | IsADirectoryError) or error.errno in _MISSING_ERRNOS:
         return InputError(where=where, found=problem, needed=needed, fix=fix)
@@ -184,8 +185,8 @@ def read_error(where: str, error: OSError, *, needed: str = "", fix: str = "") -
 
 
 def is_os_read_error(error: BaseException) -> bool:
-    """Return whether the operating system refused to read, as opposed to a library that found a damaged file."""
-    # EINVAL comes from a seek before the start, which the offsets of a damaged file cause.
+    """Return whether an error is from the operating system, rather than from a library that found a damaged file."""
+    # EINVAL: a seek to a negative position, caused by an offset in a damaged file.
     return isinstance(error, OSError) and error.errno != errno.EINVAL
 
 
@@ -215,10 +216,10 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def read_small_file(path: str | Path, max_bytes: int) -> bytes:
-    """Return the content of a small untrusted file, reading at most `max_bytes` (and one byte to detect more).
+    """Return the content of a small untrusted file, reading at most `max_bytes` + 1 bytes.
 
     Raises:
-        InputError: The file is larger, a git-lfs pointer, or may never end, such as a pipe.
+        InputError: The file is larger, or a git-lfs pointer, a pipe or a device.
         OSError: There is no such file, or it cannot be read.
     """
     require_regular_file(path)
@@ -243,22 +244,22 @@ def read_range(path: str | Path, start: int, length: int) -> bytes:
 
 
 def read_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-    """Return several (start, length) pieces of a file, each complete; behind a URL they are fetched concurrently.
+    """Return several (start, length) ranges of a file, each complete; behind a URL they are fetched concurrently.
 
     Raises:
-        OSError: There is no such file, it cannot be read, or it ends within a piece.
+        OSError: There is no such file, it cannot be read, or it ends within a range.
         UnreachableError: The URL cannot be reached.
     """
     if is_url(path):
         return remote.read_ranges(str(path), ranges)
-    pieces = []
+    contents = []
     with Path(path).open("rb") as file:
         for start, length in ranges:
             file.seek(start)
-            pieces.append(file.read(length))
-            if len(pieces[-1]) < length:
-                raise ShortReadError(f"{path}: {len(pieces[-1])} of {length} bytes at {start}")
-    return pieces
+            contents.append(file.read(length))
+            if len(contents[-1]) < length:
+                raise ShortReadError(f"{path}: {len(contents[-1])} of {length} bytes at {start}")
+    return contents
 
 
 def sha256_of_file(path: Path) -> str:
@@ -276,14 +277,14 @@ def sha256_of_file(path: Path) -> str:
 
 @contextmanager
 def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
-    """Open a local file for writing that appears under its name only when the block ends without an error.
+    """Open a local file for writing; it appears under its name only if the `with` block ends without an error.
 
     Missing folders are created. The bytes are on the disk (fsync) before the file is renamed to its final name.
     """
     target = Path(path)
     temporary = _new_partial(target.parent, target.name)
     try:
-        with temporary.open("xb") as file:  # opened by name: some libraries derive the format from the name
+        with temporary.open("xb") as file:  # opened by name, which some libraries need to choose the format
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -304,11 +305,11 @@ def write_atomically(path: str | Path, data: bytes | str) -> None:
 
 @contextmanager
 def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
-    """Yield an empty temporary folder whose files are moved to `folder` when the block ends without an error.
+    """Yield an empty temporary folder, and move its files to `folder` if the `with` block ends without an error.
 
     A new folder appears complete. An existing folder is not replaced (it may be the working directory, or mounted) and
-    keeps its other files: the old manifest is removed first and the new one is moved last, so a folder with a manifest
-    is always complete.
+    keeps its other files. The old manifest is removed first and the new manifest is moved last, so a folder with a
+    manifest is always complete.
 
     Args:
         folder: The target folder; missing folders are created.
@@ -325,7 +326,9 @@ def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
         temporary = _new_partial(target if is_folder else target.parent, target.name)
         temporary.mkdir()
     try:
-        with translate_write_errors(folder, errors=_DISK_FULL_ERRNOS):  # any other error of the block is the caller's
+        with translate_write_errors(
+            folder, errors=_DISK_FULL_ERRNOS
+        ):  # the caller handles all other errors of the block
             yield temporary
         with translate_write_errors(folder):
             if is_folder:
@@ -361,7 +364,7 @@ def translate_write_errors(path: str | Path, errors: frozenset[int] = _WRITE_ERR
     """Raise an error for the user if a local path cannot be written, or the disk is full.
 
     Raises:
-        InputError: Instead of an OSError with one of these numbers; other errors pass.
+        InputError: Instead of an OSError whose number is in `errors`. Other errors are not changed.
     """
     try:
         yield
@@ -379,7 +382,7 @@ def is_empty(folder: Path) -> bool:
 
 
 def require_new_folder(folder: Path) -> None:
-    """Check that a path is free for a new folder: it does not exist, or is an empty folder.
+    """Check that a path does not exist or is an empty folder.
 
     Raises:
         InputError: The path is a file or a folder that is not empty, or cannot be listed.
@@ -392,7 +395,7 @@ def require_new_folder(folder: Path) -> None:
 
 
 def check_local_writable(path: Path) -> None:
-    """Test whether a folder, or its nearest existing parent, can be written, with a temporary file.
+    """Test with a temporary file whether a folder, or its nearest existing parent, can be written.
 
     Raises:
         OSError: The folder cannot be written.
@@ -402,7 +405,7 @@ def check_local_writable(path: Path) -> None:
 
 
 def free_bytes(folder: Path) -> int:
-    """Return the free bytes on the disk of a folder; the folder need not exist yet."""
+    """Return the number of free bytes on the disk of a folder, which need not exist yet."""
     return shutil.disk_usage(_nearest_existing(folder)).free
 
 
@@ -411,7 +414,7 @@ def _nearest_existing(path: Path) -> Path:
 
 
 def _new_partial(parent: Path, name: str) -> Path:
-    """Return a temporary path in `parent` for a file or folder that will be renamed to `name`; create `parent`."""
+    """Create `parent`, and return a temporary path in it for a file or folder that will be renamed to `name`."""
     parent.mkdir(parents=True, exist_ok=True)
     remove_abandoned(parent.absolute())
     short_name = name.encode(errors="surrogateescape")[:_NAME_BYTES].decode(errors="ignore")
@@ -420,9 +423,9 @@ def _new_partial(parent: Path, name: str) -> Path:
 
 @functools.cache
 def remove_abandoned(folder: Path) -> None:
-    """Remove partial files that are unchanged for a day from a folder; files that cannot be removed are skipped.
+    """Remove partial files that are unchanged for a day from a folder. Files that cannot be removed are skipped.
 
-    Each process scans a folder only once, before its first write there, because folders may hold thousands of files.
+    Each process scans a folder only once, because it may contain thousands of files.
     """
     with suppress(OSError):
         for path in [path for path in folder.iterdir() if _PARTIAL.fullmatch(path.name) and not path.is_symlink()]:

@@ -1,8 +1,7 @@
-"""Resolution of paths from the user: the same rules for config keys, options and environment variables.
+"""Paths from the user, with the same rules for config keys, options and environment variables.
 
-`~` is the user's home. Where only a local folder is allowed, a URL is refused, because as a path it would create a
-folder called `gs:`. An invalid path raises a ValueError whose message completes a sentence that starts with the name
-of the config key.
+`~` is the user's home. If a path must be local, a URL is refused, because it would create a folder called `gs:`. An
+invalid path raises a ValueError whose message completes a sentence that starts with the name of the config key.
 """
 
 from __future__ import annotations
@@ -19,16 +18,16 @@ SIMULATION_FILE = "simulation.json"  # in a data set written by `simulate record
 HUB = "hf://"
 
 _REPOSITORY = re.compile(r"hf://[\w.-]+/[\w.-]+(@[\w./-]+)?")
-_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # also with one slash: Path("gs://a") becomes "gs:/a"
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # one slash is enough, because str(Path("gs://a")) is "gs:/a"
 
 
 def is_url(path: str | Path) -> bool:
-    """Return whether a path is a URL that fsspec reads (`gs://…`) rather than a local path."""
+    """Return whether a path is a URL such as `gs://…`, not a local path."""
     return "://" in str(path)
 
 
 def parse_folder(path: str) -> Path | str:
-    """Return a local folder (also `file://`) as a Path, or a remote folder as its URL."""
+    """Return a local folder, possibly a `file://` URL, as a Path; return a remote folder as its URL."""
     local = path.removeprefix("file://")
     return local if is_url(local) else Path(local)
 
@@ -63,19 +62,19 @@ def resolve_local_path(path: str) -> str:
 
 
 def resolve_model_path(name: str) -> str:
-    """Resolve the name of a model: keep a built-in name, resolve any other as `resolve_local_path` does.
+    """Resolve the path of a model with `resolve_local_path`; a built-in name is returned unchanged.
 
     Raises:
-        ValueError: As `resolve_local_path`.
+        ValueError: As for `resolve_local_path`.
     """
     return name if name.startswith(BUILTIN) else resolve_local_path(name)
 
 
 def resolve_encoder_path(name: str) -> str:
-    """Resolve the name of an encoder: keep a Hub repository, resolve any other as `resolve_model_path` does.
+    """Resolve the path of an encoder with `resolve_model_path`; a Hub repository is returned unchanged.
 
     Raises:
-        ValueError: As `resolve_local_path`; or the Hub repository has no owner or no name.
+        ValueError: As for `resolve_local_path`; or the Hub repository has no owner or no name.
     """
     if not name.startswith(HUB):
         return resolve_model_path(name)
@@ -85,5 +84,5 @@ def resolve_encoder_path(name: str) -> str:
 
 
 def to_config_value(path: Path) -> str:
-    """Return a path as a config value that resolves to the same path, also for a folder whose name starts with `~`."""
+    """Return the config value for a path: the path itself, with `./` before a name that starts with `~`."""
     return f"./{path}" if str(path).startswith("~") else str(path)

@@ -20,15 +20,15 @@ from vjepa2_ac.storage import retries
 
 _T = TypeVar("_T")
 
-_THREADS = 64  # concurrent reads of `read_ranges` in a process
-_PART_BYTES = 16 << 20  # longer reads are split into parts, each with the full time-out
-_MIN_BYTES_PER_S = 1 << 20  # a write gets its size divided by this speed, in addition to the usual time-out
+_THREADS = 64  # for the concurrent reads of a process
+_PART_BYTES = 16 << 20  # longer reads are split into parts, each with its own time-out
+_MIN_BYTES_PER_S = 1 << 20  # slowest upload; the time-out of a write is extended by its size divided by this speed
 _VERSION_KEYS = ("generation", "etag", "ETag", "blob_id", "mtime", "last_modified", "LastModified", "created")
 
 _LOGIN_COMMANDS = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
-_EXTRAS = {"gs": "gcs", "hf": ""}  # extra of this package per protocol; empty: always installed
+_EXTRAS = {"gs": "gcs", "hf": ""}  # the extra that installs the library of a protocol; empty: always installed
 _SUPPORTED_LOCATIONS = "a local folder, or a gs://, hf:// or s3:// URL"
-_CHAINED_PROTOCOLS = frozenset({  # chained fsspec protocols, which wrap other file systems; some execute templates
+_CHAINED_PROTOCOLS = frozenset({  # fsspec protocols that wrap other file systems; some of them execute templates
     "async_wrapper", "asyncwrapper", "blockcache", "cached", "dask", "data", "dir", "filecache", "generic",
     "libarchive", "reference", "simplecache", "tar", "zip",
 })  # fmt: skip
@@ -36,7 +36,7 @@ _EMULATOR = "STORAGE_EMULATOR_HOST"
 _PRODUCT_NAME_FILE = Path("/sys/class/dmi/id/product_name")
 
 
-_POINTER = b"version https://git-lfs.github.com/spec/v1"  # first bytes of the pointer that git-lfs commits for a file
+_POINTER = b"version https://git-lfs.github.com/spec/v1"  # first bytes of a git-lfs pointer
 
 
 class ShortReadError(OSError):
@@ -48,7 +48,7 @@ class FileInfo(NamedTuple):
 
     name: str
     size: int  # in bytes
-    version: str  # changes with the content, as far as the listing shows
+    version: str  # changes with the content; empty if the server has no version
     is_file: bool = True
 
 
@@ -93,7 +93,7 @@ def file_version(url: str) -> str:
 def list_folder(url: str) -> list[FileInfo]:
     """Return the entries of a folder, sorted by name; an empty list if there is no such folder.
 
-    One listing is requested, with one request per page.
+    The server needs one request per page of the listing.
 
     Raises:
         UnreachableError: The URL cannot be reached.
@@ -110,7 +110,7 @@ def list_folder(url: str) -> list[FileInfo]:
 
 
 def list_files_below(url: str) -> dict[str, FileInfo]:
-    """Return all files below a folder by their relative paths, with one uncached listing (one request per page).
+    """Return all files below a folder by their relative paths, from one listing that is not cached.
 
     Raises:
         FileNotFoundError: There is no such folder; on Google Cloud Storage, no such bucket.
@@ -136,14 +136,14 @@ def upload(source: Path, url: str) -> None:
     """
     filesystem = _filesystem(url, writing=True)
     names = (str(source), filesystem._strip_protocol(url))
-    # Small pieces, because fsspec's event loop is blocked while a piece is read from the disk.
-    pieces = {"chunksize": _PART_BYTES} if _protocol(url) == "gs" else {}
-    allowed_s = retries.DEFAULT.timeout_s + source.stat().st_size / _MIN_BYTES_PER_S
+    # Small chunks, because fsspec's event loop is blocked while a chunk is read from the disk.
+    options = {"chunksize": _PART_BYTES} if _protocol(url) == "gs" else {}
+    timeout_s = retries.DEFAULT.timeout_s + source.stat().st_size / _MIN_BYTES_PER_S
     _retry(
         url,
-        lambda timeout_s: _call_filesystem(filesystem, "put_file", timeout_s, *names, **pieces),
+        lambda timeout_s: _call_filesystem(filesystem, "put_file", timeout_s, *names, **options),
         "written",
-        allowed_s,
+        timeout_s,
     )
 
 
@@ -166,8 +166,9 @@ def read_range(url: str, start: int, length: int) -> bytes:
         UnreachableError: The URL cannot be reached.
     """
     if length > _PART_BYTES:
-        cuts = range(start, start + length, _PART_BYTES)
-        return b"".join(_concurrently(url, [(cut, min(_PART_BYTES, start + length - cut)) for cut in cuts]))
+        end = start + length
+        parts = [(begin, min(_PART_BYTES, end - begin)) for begin in range(start, end, _PART_BYTES)]
+        return b"".join(_read_concurrently(url, parts))
     data = _retry(url, lambda timeout_s: _read_once(url, start, length, timeout_s)) if length > 0 else b""
     if start == 0:
         refuse_pointer(url, data)
@@ -181,11 +182,11 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         OSError: There is no such file, or it ends within a range.
         UnreachableError: The URL cannot be reached.
     """
-    pieces = _concurrently(url, ranges)
-    for (start, length), piece in zip(ranges, pieces, strict=True):
-        if len(piece) < length:
-            raise ShortReadError(f"{url}: {len(piece)} of {length} bytes at {start}")
-    return pieces
+    contents = _read_concurrently(url, ranges)
+    for (start, length), content in zip(ranges, contents, strict=True):
+        if len(content) < length:
+            raise ShortReadError(f"{url}: {len(content)} of {length} bytes at {start}")
+    return contents
 
 
 def read_adjacent_ranges(url: str, ranges: Sequence[tuple[int, int]], gap_bytes: int = 0) -> list[bytes]:
@@ -196,18 +197,18 @@ def read_adjacent_ranges(url: str, ranges: Sequence[tuple[int, int]], gap_bytes:
         ranges: (start, length) ranges, ascending.
         gap_bytes: Ranges at most this far apart are fetched together with the gap between them.
     """
-    runs: list[list[tuple[int, int]]] = []
+    groups: list[list[tuple[int, int]]] = []  # each is fetched in one request; sum(range) is the end of a range
     for start, length in ranges:
-        if runs and start - sum(runs[-1][-1]) <= gap_bytes:
-            runs[-1].append((start, length))
+        if groups and start - sum(groups[-1][-1]) <= gap_bytes:
+            groups[-1].append((start, length))
         else:
-            runs.append([(start, length)])
-    fetched = read_ranges(url, [(run[0][0], sum(run[-1]) - run[0][0]) for run in runs])
-    pieces = zip(runs, fetched, strict=True)
-    return [data[start - run[0][0] :][:length] for run, data in pieces for start, length in run]
+            groups.append([(start, length)])
+    contents = read_ranges(url, [(group[0][0], sum(group[-1]) - group[0][0]) for group in groups])
+    fetched = zip(groups, contents, strict=True)
+    return [data[start - group[0][0] :][:length] for group, data in fetched for start, length in group]
 
 
-def _concurrently(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+def _read_concurrently(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
     if len(ranges) < 2 or any(length > _PART_BYTES for _, length in ranges):
         return [read_range(url, start, length) for start, length in ranges]
     return list(_threads(os.getpid()).map(lambda bounds: read_range(url, *bounds), ranges))
@@ -250,7 +251,7 @@ def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
 
 
 def _size_once(url: str, timeout_s: float) -> int:
-    """Return the size of a file with one request; on Google Cloud Storage skip the check whether it is a folder."""
+    """Return the size of a file with one request; on Google Cloud Storage without a check for folders."""
     method = "get_object" if hasattr(_filesystem(url), "_get_object") else "info"
     return int(_call_method(url, method, timeout_s)["size"])
 
@@ -269,7 +270,7 @@ def _retry(url: str, action: Callable[[float], _T], operation: str = "read", tim
 
 
 def _call_method(url: str, method: str, timeout_s: float, *, writing: bool = False, **arguments: Any) -> Any:
-    """Call a method of the URL's file system with the URL's path, without retries; async ones have a time-out."""
+    """Call a method of the URL's file system with the URL's path, without retries. Only async methods time out."""
     filesystem = _filesystem(url, writing=writing)
     return _call_filesystem(filesystem, method, timeout_s, filesystem._strip_protocol(url), **arguments)
 
@@ -298,7 +299,7 @@ def login_hint(url: str) -> str:
 def google_token() -> str:
     """Return gcsfs' name for the available Google login: the user's default login, else the machine's, else anonymous.
 
-    DROID needs no login. A local emulator never receives a login.
+    Public data sets such as DROID need no login. A local emulator never receives a login.
     """
     if os.environ.get(_EMULATOR):
         return "anon"
@@ -318,10 +319,10 @@ _opening = threading.Lock()
 def _filesystem(url: str, *, writing: bool = False) -> Any:
     """Return the file system of a URL, shared by all threads of a process (fsspec would create one per thread).
 
-    Readers request read access only, because some logins may not write.
+    For reading, only read access is requested, because some logins may not write.
 
     Raises:
-        InputError: The library for the protocol is not installed or does not exist.
+        InputError: The protocol is unknown or not supported, or its library is not installed.
     """
     protocol = _protocol(url)
     with _opening:
@@ -335,10 +336,10 @@ def _filesystem(url: str, *, writing: bool = False) -> Any:
                 filesystem = (
                     _open_google(kind, options) if protocol == "gs" else kind(**options, skip_instance_cache=True)
                 )
-            except TypeError as error:  # this file system needs more arguments than a URL holds
+            except TypeError as error:  # this file system needs arguments that a URL cannot contain
                 raise InputError(
                     where=url,
-                    found=f"{protocol}:// needs options that a URL cannot hold ({error})",
+                    found=f"{protocol}:// needs options that a URL cannot contain ({error})",
                     needed=_SUPPORTED_LOCATIONS,
                 ) from None
             _filesystems[key] = filesystem
@@ -351,8 +352,8 @@ def _protocol(url: str) -> str:
 
 
 def _import_filesystem(url: str, protocol: str) -> Any:
-    # Before gcsfs is imported: its support for zonal buckets, on by default, makes the first call to each bucket wait
-    # for a minute where the Storage Control API does not answer.
+    # Set before gcsfs is imported. With its support for zonal buckets, which is on by default, the first call to each
+    # bucket takes a minute if the Storage Control API does not respond.
     os.environ.setdefault("GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT", "false")
     import fsspec
 
@@ -373,12 +374,12 @@ def _import_filesystem(url: str, protocol: str) -> Any:
 
 def _open_google(kind: Any, options: dict[str, Any]) -> Any:
     """Open gcsfs without its own retries, which would add six attempts (up to 30 s) to each of `call_with_retries`."""
-    once = getattr(kind._request, "__wrapped__", kind._request)
-    open_as = partial(type(kind.__name__, (kind,), {"_request": once}), use_listings_cache=False, **options)
+    request_once = getattr(kind._request, "__wrapped__", kind._request)
+    open_with = partial(type(kind.__name__, (kind,), {"_request": request_once}), use_listings_cache=False, **options)
     login = google_token()
     try:
-        return open_as(token=login)
+        return open_with(token=login)
     except (ValueError, OSError):
         if login != "cloud":
             raise
-        return open_as(token="anon")  # noqa: S106 - a cloud machine may have no service account
+        return open_with(token="anon")  # noqa: S106 - a cloud machine may have no service account

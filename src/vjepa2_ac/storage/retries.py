@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
-# 499 is Google's answer to cancelling an upload after a failed piece; gcsfs raises it instead of that failure.
+# 499: when a part of an upload fails, gcsfs cancels the upload and raises the status of the cancellation.
 _TEMPORARY_STATUS = frozenset({408, 425, 429, 499, *range(500, 600)})
 _NO_ACCESS = frozenset({401, 403, 407})
 _MISSING_ERRORS = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
@@ -29,11 +29,11 @@ _WARNING_INTERVAL_S = 30.0
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """The duration of retries: at most `attempts` attempts of `timeout_s` each, plus the waits between them.
+    """Limits of retries: at most `attempts` attempts of `timeout_s` each, with waits between them.
 
-    The waits double from the first to the longest. Half of each wait is random, so that many processes do not retry at
-    the same moment. A library without time-outs, or with retries of its own (huggingface_hub: six), takes longer per
-    attempt; no attempt starts after `total_s`.
+    The waits double from `first_wait_s` to `longest_wait_s`. Up to half of each wait is random, so that many processes
+    do not retry at the same moment. An attempt takes longer in a library without time-outs or with its own retries
+    (huggingface_hub: six). No attempt starts after `total_s`.
     """
 
     attempts: int = 8
@@ -45,10 +45,12 @@ class RetryPolicy:
     def wait_s(self, failures: int) -> float:
         """Return the wait in seconds after the given number of failures in a row."""
         longest: float = min(self.first_wait_s * 2 ** (failures - 1), self.longest_wait_s)
-        return longest * (1 + secrets.randbelow(1001) / 1000) / 2  # leaves the random generators of a run unchanged
+        return (
+            longest * (1 + secrets.randbelow(1001) / 1000) / 2
+        )  # `secrets` leaves the seeded random generators unchanged
 
 
-DEFAULT = RetryPolicy()  # gives up within 1 minute if errors are immediate, within 5 if the server never responds
+DEFAULT = RetryPolicy()  # takes at most 1 minute if attempts fail immediately, 5 minutes if the server never responds
 
 
 def call_with_retries(
@@ -66,16 +68,15 @@ def call_with_retries(
         where: What is read or written, for messages.
         action: Called with its time limit in seconds.
         policy: Number of attempts, waits and time limits.
-        access: The fix for missing permission, as a sentence.
+        access: The fix if permission is missing, as a sentence.
         operation: "read" or "written", for messages.
-        progress: Returns the progress of an action that can resume. Attempts and time are counted from zero again
-            after each attempt that made progress.
+        progress: Returns the progress of an action that can resume. Attempts and time are counted from zero after
+            each attempt that made progress.
 
     Raises:
         InputError: Raised by the action, like any other `UserError`.
-        OSError: There is no such file, it is a folder where a file is expected, or a file where a folder is.
-        UnreachableError: The failure did not pass in time; a RefusedError if permission is missing or the failure is
-            permanent.
+        OSError: There is no such file, or a file was expected instead of a folder, or a folder instead of a file.
+        UnreachableError: All attempts failed; a RefusedError if permission is missing or the failure is permanent.
     """
     started, failures, last_progress = time.monotonic(), 0, progress()
     while True:
@@ -105,7 +106,7 @@ def call_with_retries(
 
 @contextmanager
 def suppress_retry_warnings() -> Iterator[None]:
-    """Log retried failures at level INFO in this thread, for callers that do not depend on the result."""
+    """Log retried failures in this thread at level INFO, for callers that can continue without the result."""
     token = _quiet.set(True)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Read JSON and YAML into mappings or typed records, and write JSON.
+"""Read JSON and YAML files as mappings or typed records, and write JSON.
 
 Untrusted files are safe to parse: neither parser executes anything, the file size is limited, and YAML aliases, which
 can expand without limit, are refused. Invalid content is an InputError, a missing file a MissingFileError.
@@ -44,7 +44,7 @@ _PYDANTIC_TERMS = {  # pydantic uses the terms of JSON; the file may be YAML
 
 
 def parse_json_object(data: bytes | str, *, where: str, needed: str = "a JSON object", fix: str = "") -> dict[str, Any]:
-    """Parse a JSON object; numbers may be NaN and infinite, as Python writes them.
+    """Parse a JSON object. NaN and Infinity are accepted, because Python's `json` writes them.
 
     Args:
         data: The text.
@@ -70,7 +70,7 @@ def read_json_object(
     """Read a JSON object from a local file or a URL.
 
     Raises:
-        InputError: As `parse_json_object`; or the file is larger than `max_bytes`.
+        InputError: As for `parse_json_object`; or the file is larger than `max_bytes`.
         MissingFileError: There is no such file.
         UnreachableError: The file cannot be read now.
     """
@@ -116,10 +116,10 @@ _adapter: Callable[[Any], Any] = cache(TypeAdapter)
 
 
 def parse_record(kind: type[T], values: Any, *, where: str, needed: str = "", fix: str = "") -> T:
-    """Create a dataclass or pydantic model from values of JSON, without converting any value to another type.
+    """Create a dataclass or pydantic model from JSON values, which are not converted to other types.
 
     Args:
-        kind: The class; its annotations may have pydantic's bounds.
+        kind: The class; its annotations may have bounds (pydantic's `Field`).
         values: A mapping from field names to values; fields with a default may be missing.
         where: The file, for messages.
         needed: The expected content, for messages.
@@ -145,7 +145,7 @@ def parse_record(kind: type[T], values: Any, *, where: str, needed: str = "", fi
 
 
 def describe_validation_error(detail: Any) -> str:
-    """Return pydantic's message for one value in this program's terms, followed by the value.
+    """Return pydantic's message about one value in the terms of this package, followed by the value.
 
     Args:
         detail: An item of `ValidationError.errors()`.
@@ -173,7 +173,7 @@ def parse_yaml(text: str, *, where: str) -> Any:
     Dates, 017 and 12:30 are strings (YAML 1.1 would read the last two as the numbers 15 and 750); 1e-4 is a number.
 
     Raises:
-        InputError: The text is not YAML, or has a duplicate key or an alias; names line and column.
+        InputError: The text is not YAML, or has a duplicate key or an alias. The message contains line and column.
     """
     try:
         return yaml.load(text, _Loader)  # noqa: S506 - a SafeLoader

@@ -1,4 +1,4 @@
-"""Safetensors files: written completely or not at all; on reading, names, shapes, types and values are checked."""
+"""Write and read safetensors files; names, shapes, types and values are checked on reading."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Write tensors to a new safetensors file, with the file mode of the umask.
+    """Write tensors to a new safetensors file, with the mode that the umask sets.
 
     Raises:
         OSError: The disk is full, or another error of the operating system.
@@ -34,7 +34,7 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
         contiguous = {name: value.detach().to("cpu").contiguous() for name, value in tensors.items()}
         save_file(contiguous, path, metadata={"format": "pt"})
         path.chmod(mode)  # safetensors 0.8 creates files with mode 0600
-    except SafetensorError as error:  # the errno is only in the text of the error
+    except SafetensorError as error:  # only the text of the error contains the errno
         number = re.search(r"os error (\d+)", str(error))
         raise OSError(int(number[1]) if number else errno.EIO, str(error), str(path)) from None
 
@@ -48,11 +48,11 @@ def read_tensors(
         path: The file.
         like: Tensors with the expected names and shapes.
         needed: The expected file, for messages.
-        fix: The fix if the file holds other tensors or a number that is not finite, as a sentence.
+        fix: The fix if the file contains other tensors or a number that is not finite, as a sentence.
         dtype: Type of the result; None: as in the file.
 
     Raises:
-        InputError: The file is missing, truncated or of another format, or holds other tensors, NaN or infinity.
+        InputError: The file is missing, truncated or of another format, or contains other tensors, NaN or infinity.
     """
     with open_safetensors(path, needed=needed) as file:
         shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
@@ -67,11 +67,11 @@ def read_tensors(
 
 @contextmanager
 def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
-    """Open a safetensors file with memory-mapped tensors, after comparing its header with its size.
+    """Open a safetensors file with memory-mapped tensors.
 
     Raises:
-        InputError: The file is missing, truncated, a git-lfs pointer, a pipe or of another format; also if a tensor
-            that is read within the block is invalid.
+        InputError: The file is missing, truncated, a git-lfs pointer, a pipe or of another format, or a tensor that is
+            read in the `with` block is invalid.
         UnreachableError: The file cannot be read.
     """
     fix = "Copy or write the folder again"
@@ -93,7 +93,7 @@ def check_tensors(
     """Refuse tensors that are missing, unknown or of another shape.
 
     Raises:
-        InputError: Names the first four such tensors.
+        InputError: Tensors do not match; the message names at most four of them.
     """
     problems = [f"missing: {name}" for name in expected.keys() - shapes.keys()]
     problems += [f"unexpected: {name}" for name in shapes.keys() - expected.keys()]
@@ -110,7 +110,7 @@ def require_floats(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> No
     """Refuse weights whose type is not float16, bfloat16, float32 or float64, because casting would change them.
 
     Raises:
-        InputError: Names the first such tensor.
+        InputError: A tensor has another type; the message names it.
     """
     for name, value in tensors.items():
         if value.dtype not in _FLOATS or value.layout is not torch.strided:
@@ -120,13 +120,13 @@ def require_floats(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> No
 
 
 def require_finite(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> None:
-    """Refuse tensors that hold NaN or infinity.
+    """Refuse tensors that contain NaN or infinity.
 
-    Minimum and maximum are finite only if all values are. They need one pass and no extra memory: about 1 s for 10^9
+    All values are finite if minimum and maximum are. This test needs one pass and no extra memory: about 1 s for 10^9
     numbers.
 
     Raises:
-        InputError: Names the first such tensor.
+        InputError: A tensor contains such a value; the message names it.
     """
     for name, value in tensors.items():
         if value.is_floating_point() and value.numel() and not torch.stack(torch.aminmax(value)).isfinite().all():

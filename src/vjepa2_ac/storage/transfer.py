@@ -1,6 +1,6 @@
 """File transfer to and from another local folder or a writable URL, and download of models from the Hub.
 
-A permanent failure to write a file is a `RefusedError`, any other an `UnreachableError`. As when reading, temporary
+If a file cannot be written, a permanent failure is a `RefusedError`, any other failure an `UnreachableError`. Temporary
 failures at a URL are retried. A file in an object store is either complete or absent.
 """
 
@@ -24,7 +24,7 @@ _TEMPORARY_ERRORS = frozenset({
     errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOSPC,
     errno.EDQUOT,
 })  # fmt: skip
-_PIECE_BYTES = 32 << 20
+_CHUNK_BYTES = 32 << 20
 
 
 def upload(source: Path, target: str) -> None:
@@ -50,7 +50,7 @@ def write(path: str, data: bytes | str) -> None:
     """Write a local file or a URL atomically, replacing an existing file; text is written as UTF-8.
 
     Raises:
-        InputError: The local disk is full, or cannot be written.
+        InputError: The local path cannot be written, or the disk is full.
         UnreachableError: The URL cannot be written; a RefusedError if that is permanent.
     """
     if not is_url(path):
@@ -77,8 +77,8 @@ def download(source: str, target: Path) -> None:
         return
     size = remote.file_size(source)
     with atomic_writer(target) as copy:
-        for start in range(0, size, _PIECE_BYTES):
-            copy.write(remote.read_range(source, start, min(_PIECE_BYTES, size - start)))
+        for start in range(0, size, _CHUNK_BYTES):
+            copy.write(remote.read_range(source, start, min(_CHUNK_BYTES, size - start)))
 
 
 def remove(path: str) -> None:
@@ -135,13 +135,13 @@ def list_files_below(url: str) -> dict[str, FileInfo]:
     try:
         return remote.list_files_below(url)
     except FileNotFoundError:
-        if url.startswith(("gs://", "gcs://")):  # has no folders, so only buckets can be missing
+        if url.startswith(("gs://", "gcs://")):  # an object store has no folders, so the bucket is missing
             raise _missing_bucket_error(url) from None
         return {}
 
 
 def check_writable(folder: str) -> None:
-    """Test whether files can be written to and removed from a folder or URL, with a temporary file.
+    """Test with a temporary file whether files can be written to a folder or URL and removed from it.
 
     Raises:
         UnreachableError: The folder cannot be written now; a RefusedError if that is permanent.
@@ -150,9 +150,9 @@ def check_writable(folder: str) -> None:
         with _translate_target_errors(folder):
             check_local_writable(Path(folder))
         return
-    trial = join(folder, f".write-check-{secrets.token_hex(8)}")
-    write(trial, "This file of vjepa2-ac may be removed.\n")
-    remove(trial)
+    test_file = join(folder, f".write-check-{secrets.token_hex(8)}")
+    write(test_file, "This file of vjepa2-ac may be removed.\n")
+    remove(test_file)
 
 
 @contextmanager

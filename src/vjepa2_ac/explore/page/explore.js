@@ -4,15 +4,15 @@
 import { Wire, byRole, createElement, createShape, formatValue, getDigits, replaceImage } from "./shared.js";
 
 /** @typedef {import("./shared.js").Header} Header */
-/** @typedef {import("./shared.js").Answer} Answer */
+/** @typedef {import("./shared.js").Reply} Reply */
 /** @typedef {{episode: number, step: number}} Goal */
-/** @typedef {{episode: number, start: number, actions: number[][], goal: Goal | null}} Position never modified, only replaced */
+/** @typedef {{episode: number, start: number, actions: number[][], goal: Goal | null}} Position objects of this type are replaced, never modified */
 /** @typedef {{text: string, rating: string}} StepLabel */
 
-const GOOD_SHARE = 0.8; // a rating is good below this share of the persistence error
-const METER_MAX = 1.25; // largest share of the persistence error on the meter
+const GOOD_RATIO = 0.8; // a rating is good below this ratio of the error to the persistence error
+const METER_MAX = 1.25; // largest ratio on the meter
 const PLAYBACK_MS = 450; // time between the steps of a playback
-const QUICK_S = 0.05; // if a model step is faster, the energy map is updated after each step
+const QUICK_S = 0.05; // if a model step takes less time, the energy map is updated after each step
 const RATINGS = { good: "✓ good", fair: "~ fair", poor: "✕ poor" };
 const LAYOUT = ["turn left", "forward", "turn right", "up", "left", "back", "right", "down", "open", "close", "zero action"];
 const KEYS = /** @type {{[key: string]: string}} */ ({
@@ -24,17 +24,17 @@ const LETTERS = new Map(Object.entries(KEYS).slice(0, 11).map(([key, id]) => [id
 
 let hello = /** @type {any} */ (null);
 let position = /** @type {Position} */ ({ episode: 0, start: 0, actions: [], goal: null });
-let prediction = /** @type {Header | null} */ (null); // answer for the current position
+let prediction = /** @type {Header | null} */ (null); // header of the reply for the current position
 const labels = /** @type {Map<string, StepLabel>} */ (new Map()); // by position
 let frames = { episode: -1, steps: /** @type {number[]} */ ([]) }; // frames of the image strips
 let sizes = /** @type {Map<string, HTMLInputElement>} */ (new Map()); // sliders of the step sizes, by group
 let sliders = /** @type {HTMLInputElement[]} */ ([]); // sliders of the custom action
-let shownModel = 0; // index of the model in the view with item model
+let shownModel = 0; // index of the model in the view with one model
 let generation = 0; // incremented to cancel queued actions, playback and searches
 let isPlaying = false;
-let queue = Promise.resolve(); // the requested actions, which are executed in sequence
+let queue = Promise.resolve(); // resolved when all requested actions have been executed, one after another
 let numQueued = 0; // number of actions in the queue
-const seenRatings = new Set(); // determines the hint
+const seenRatings = new Set(); // ratings so far, which determine the hint
 
 const wire = new Wire("socket", {
   received: ({ header }) => setUp(header),
@@ -57,8 +57,8 @@ const truncatePath = (count) => ({ ...position, actions: position.actions.slice(
 /** Return the state of the page as the fragment of a link. */
 function formatFragment() {
   /** @param {number} value */
-  const short = (value) => (Math.round(value * 1e5) ? String(Math.round(value * 1e5) / 1e5) : "");
-  const actions = position.actions.map((action) => action.map(short).join(",")).join(";");
+  const format = (value) => (Math.round(value * 1e5) ? String(Math.round(value * 1e5) / 1e5) : "");
+  const actions = position.actions.map((action) => action.map(format).join(",")).join(";");
   const goal = position.goal && `&g=${position.goal.episode}.${position.goal.step}`;
   return `#e=${position.episode}&t=${position.start}${position.actions.length ? `&a=${actions}` : ""}${goal ?? ""}`;
 }
@@ -76,7 +76,7 @@ async function restore() {
 }
 
 /**
- * Go to another position and cancel running work. Returns whether the position is shown.
+ * Go to another position and cancel running work. Return whether the position is shown.
  *
  * @param {Position} next
  */
@@ -87,19 +87,19 @@ async function goTo(next) {
   return show();
 }
 
-/** Request the prediction at the current position and draw it. Returns whether it is shown. */
+/** Request the prediction at the current position and draw it. Return whether it is shown. */
 async function show() {
   const requested = position;
   history.replaceState(null, "", formatFragment());
-  const answer = await sendRequest("predict", requested);
-  if (!answer || requested !== position) return false;
-  draw(answer);
+  const reply = await sendRequest("predict", requested);
+  if (!reply || requested !== position) return false;
+  draw(reply);
   if (byRole("goal").open && hello.step_seconds < QUICK_S && !isPlaying && numQueued < 2) showEnergy();
   return true;
 }
 
 /**
- * Send a request and show the progress, or the error of the server.
+ * Send a request and show its progress, or the server's error. Return the reply; null if there is none.
  *
  * @param {string} kind
  * @param {object} fields
@@ -119,16 +119,16 @@ async function sendRequest(kind, fields) {
 
 /** @param {number} episode */
 async function openEpisode(episode) {
-  const answer = await sendRequest("episode", { episode });
-  if (!answer || position.episode !== episode) return false;
-  const steps = /** @type {number[]} */ (answer.header.steps);
+  const reply = await sendRequest("episode", { episode });
+  if (!reply || position.episode !== episode) return false;
+  const steps = /** @type {number[]} */ (reply.header.steps);
   frames = { episode, steps };
   byRole("episode").value = String(episode);
-  const images = steps.map((_, number) => answer.images.get(`frame-${number}`));
+  const images = steps.map((_, number) => reply.images.get(`frame-${number}`));
   const last = hello.episodes[episode].steps - 1 - hello.stride;
-  strip("start-strip", images, (step) => goTo({ ...position, start: step, actions: [] }), last);
+  drawStrip("start-strip", images, (step) => goTo({ ...position, start: step, actions: [] }), last);
   const copies = images.map((image) => image?.cloneNode());
-  strip("goal-strip", copies, (step) => goTo({ ...position, goal: { episode, step } }), Infinity);
+  drawStrip("goal-strip", copies, (step) => goTo({ ...position, goal: { episode, step } }), Infinity);
   position = { ...position, goal: position.goal ?? { episode, step: steps[steps.length - 1] } };
   return true;
 }
@@ -174,9 +174,9 @@ function stop() {
 }
 
 /**
- * Play back actions until there are no more.
+ * Execute actions one after another, with a pause between them.
  *
- * @param {() => number[] | null | undefined} next
+ * @param {() => number[] | null | undefined} next returns the next action; null or undefined: no more actions
  */
 async function play(next) {
   stop();
@@ -208,8 +208,8 @@ function getMoveAction(move) {
 
 /** @param {string} id */
 function move(id) {
-  const known = hello.moves.find((/** @type {any} */ candidate) => candidate.id === id);
-  if (known) act(getMoveAction(known));
+  const command = hello.moves.find((/** @type {any} */ candidate) => candidate.id === id);
+  if (command) act(getMoveAction(command));
   flash(byRole("moves").querySelector(`[data-move="${CSS.escape(id)}"]`));
 }
 
@@ -224,8 +224,8 @@ function flash(button) {
 async function showEnergy() {
   const requested = position;
   const action = getCustomAction();
-  const answer = await sendRequest("energy", { ...requested, model: byRole("model").value, action });
-  if (answer && requested === position) drawMaps(answer.header, action);
+  const reply = await sendRequest("energy", { ...requested, model: byRole("model").value, action });
+  if (reply && requested === position) drawMaps(reply.header, action);
 }
 
 async function plan() {
@@ -233,13 +233,13 @@ async function plan() {
   const current = generation;
   byRole("goal").open = true;
   const steps = Math.min(8, Math.max(1, Math.round(Number(byRole("plan-steps").value)) || 1));
-  const answer = await sendRequest("plan", { ...position, model: byRole("model").value, steps });
-  if (!answer || current !== generation) return;
-  const { energy_now: now, energy_plan: then, iterations, actions } = answer.header;
-  const energies = `Energy ${formatNumber(now)} at the current frame, ${formatNumber(then)} predicted after ${pluralize(actions.length, "step")}.`;
+  const reply = await sendRequest("plan", { ...position, model: byRole("model").value, steps });
+  if (!reply || current !== generation) return;
+  const { energy_now: energyNow, energy_plan: planEnergy, iterations, actions } = reply.header;
+  const energies = `Energy ${formatNumber(energyNow)} at the current frame, ${formatNumber(planEnergy)} predicted after ${pluralize(actions.length, "step")}.`;
   byRole("plan-text").textContent = `${energies} Best sample of each iteration:`;
   replaceImages(byRole("best"), iterations.map((/** @type {any} */ item, /** @type {number} */ number) => {
-    const image = answer.images.get(`best-${number}`);
+    const image = reply.images.get(`best-${number}`);
     return createElement("figure", {}, ...(image ? [image] : []), createElement("figcaption", {}, `${number + 1}: ${formatNumber(item.lowest)}`));
   })); // prettier-ignore
   byRole("planned").hidden = false;
@@ -264,14 +264,14 @@ function showMessage(text) {
  * Show or hide the progress of a computation.
  *
  * @param {string | null} text null: nothing is computed
- * @param {number | null} share
+ * @param {number | null} fraction null: unknown
  */
-function showProgress(text, share = null) {
+function showProgress(text, fraction = null) {
   byRole("main").setAttribute("aria-busy", String(text !== null));
   byRole("working").classList.toggle("on", text !== null);
   byRole("progress-text").textContent = text ?? "";
-  if (share === null) byRole("progress").removeAttribute("value");
-  else byRole("progress").value = share;
+  if (fraction === null) byRole("progress").removeAttribute("value");
+  else byRole("progress").value = fraction;
 }
 
 /** @param {Element} parent @param {Node[]} children */
@@ -283,7 +283,7 @@ function replaceImages(parent, children) {
 /** @param {number | null} error @param {number | null} persistence */
 function getRating(error, persistence) {
   if (error === null || persistence === null) return "";
-  return error < GOOD_SHARE * persistence ? "good" : error > persistence ? "poor" : "fair";
+  return error < GOOD_RATIO * persistence ? "good" : error > persistence ? "poor" : "fair";
 }
 
 /** @param {HTMLElement} chip @param {string} rating */
@@ -293,7 +293,7 @@ function drawRating(chip, rating) {
   chip.textContent = RATINGS[/** @type {keyof RATINGS} */ (rating)] ?? "";
 }
 
-/** @param {Answer} answer to a request `predict` */
+/** @param {Reply} reply to a request `predict` */
 function draw({ header, images }) {
   prediction = header;
   const last = header.actions.length ? header.actions[header.actions.length - 1] : null;
@@ -306,10 +306,10 @@ function draw({ header, images }) {
     replaceImage(byRole("large", figure), images.get(`predicted-${item.id}`));
     replaceImage(byRole("small", figure), map);
     drawRating(byRole("rating", figure), ratings[number]);
-    const share = item.error === null || !header.persistence_error || !last ? null : item.error / header.persistence_error;
-    byRole("meter", figure).hidden = share === null;
-    byRole("meter", figure).firstChild.style.left = `${(100 * Math.min(share ?? 0, METER_MAX)) / METER_MAX}%`;
-    const comparison = share === null ? "" : `error ${formatNumber(item.error)}, ${Math.round(100 * share)} % of persistence`;
+    const ratio = item.error === null || !header.persistence_error || !last ? null : item.error / header.persistence_error;
+    byRole("meter", figure).hidden = ratio === null;
+    byRole("meter", figure).firstChild.style.left = `${(100 * Math.min(ratio ?? 0, METER_MAX)) / METER_MAX}%`;
+    const comparison = ratio === null ? "" : `error ${formatNumber(item.error)}, ${Math.round(100 * ratio)} % of persistence`;
     byRole("about", figure).textContent = comparison || (last ? "" : "no action yet");
   });
   const truth = getView("truth");
@@ -326,8 +326,8 @@ function draw({ header, images }) {
   drawMetrics(header, ratings);
   drawPose(header);
   drawTrail();
-  mark("start-strip", header.start);
-  mark("goal-strip", position.goal?.episode === frames.episode ? position.goal.step : -1);
+  markFrame("start-strip", header.start);
+  markFrame("goal-strip", position.goal?.episode === frames.episode ? position.goal.step : -1);
   byRole("maps").classList.add("outdated");
   byRole("undo").disabled = byRole("reset").disabled = !last;
   const recorded = byRole("moves").querySelector('[data-move="recorded"]');
@@ -341,8 +341,8 @@ function drawSummary(header, text, ratings) {
       `${item.id} error ${formatNumber(item.error)}${ratings[number] && ` (${ratings[number]})`}`,
   );
   const { name } = hello.episodes[header.episode];
-  const known = header.persistence_error === null ? "ground truth not available" : `${errors.join(", ")}, persistence ${formatNumber(header.persistence_error)}`;
-  showMessage(header.actions.length ? `${text}: ${known}. ${header.note}` : `${name}, control step ${header.start}: the start frame.`);
+  const result = header.persistence_error === null ? "ground truth not available" : `${errors.join(", ")}, persistence ${formatNumber(header.persistence_error)}`;
+  showMessage(header.actions.length ? `${text}: ${result}. ${header.note}` : `${name}, control step ${header.start}: the start frame.`);
 }
 
 /** @param {string[]} ratings ratings of the models; the last item is that of the main model */
@@ -354,7 +354,7 @@ function drawHint(ratings) {
     ? "Press W, A, S or D to command a motion, and compare the predicted frame with the ground truth."
     : "Press + or − of a number to command a motion, and compare the predicted frame with the ground truth.";
   if (hasGood && hasPoor) text = "Try smaller and larger steps to find where the predictions break down.";
-  else if (hasGood) text = "This action is predicted well. Try others: the gripper (C), a rotation (Q), a larger step, or many steps.";
+  else if (hasGood) text = "This action is predicted well. Try other actions: the gripper (C), a rotation (Q), a larger step, or many steps.";
   else if (seenRatings.size) text = "Find an action that is predicted well: try other directions, larger steps or the recorded action (N).";
   byRole("hint").textContent = text;
 }
@@ -364,17 +364,17 @@ const getView = (id) => /** @type {any} */ (byRole("images").querySelector(`[dat
 
 /** @param {number[]} action */
 function describeAction(action) {
-  const moved = action.flatMap((number, axis) => {
+  const changed = action.flatMap((number, axis) => {
     const unit = hello.action[axis];
     return Math.abs(number * unit.factor) < 0.5 * 10 ** -getDigits(unit) ? [] : [axis];
   });
-  if (!moved.length) return "zero action";
-  const [axis] = moved;
-  const known = hello.moves.find((/** @type {any} */ item) => item.axis === axis && item.sign === Math.sign(action[axis]));
-  if (moved.length === 1 && hello.is_pose && known) {
-    return `${known.label} ${formatValue(Math.abs(action[axis]), hello.action[axis])}`;
+  if (!changed.length) return "zero action";
+  const [axis] = changed;
+  const command = hello.moves.find((/** @type {any} */ item) => item.axis === axis && item.sign === Math.sign(action[axis]));
+  if (changed.length === 1 && hello.is_pose && command) {
+    return `${command.label} ${formatValue(Math.abs(action[axis]), hello.action[axis])}`;
   }
-  return moved.map((item) => `${hello.action[item].name} ${formatValue(action[item], hello.action[item], true)}`).join(", ");
+  return changed.map((item) => `${hello.action[item].name} ${formatValue(action[item], hello.action[item], true)}`).join(", ");
 }
 
 /** @param {Header} header @param {string[]} ratings */
@@ -419,10 +419,10 @@ function drawPath(path, truth) {
   const [x0, y0, z0] = path[0];
   const offsets = [...path, truth ?? path[0]].map(([x, y, z]) => [y0 - y, x0 - x, z0 - z]);
   const scale = 78 / Math.max(0.12, ...offsets.flat().map(Math.abs));
-  const at = (/** @type {number[]} */ offset) => offset.map((item) => item * scale);
-  const points = offsets.slice(0, -1).map(at);
+  const toPixels = (/** @type {number[]} */ offset) => offset.map((item) => item * scale);
+  const points = offsets.slice(0, -1).map(toPixels);
   const [u, v, w] = points[points.length - 1];
-  const [tu, tv, tw] = at(offsets[offsets.length - 1]);
+  const [tu, tv, tw] = toPixels(offsets[offsets.length - 1]);
   const grid = [-0.2, -0.15, -0.1, -0.05, 0, 0.05, 0.1, 0.15, 0.2].map((item) => item * scale).filter((item) => Math.abs(item) < 92);
   const lines = grid.map((item) => `M${item - 8} -92V92M-100 ${item}H84`).join("");
   const shapes = [
@@ -441,11 +441,11 @@ function drawPath(path, truth) {
 
 function drawTrail() {
   const steps = [...Array(position.actions.length + 1).keys()].map((number) => {
-    const known = labels.get(getKey(truncatePath(number)));
+    const label = labels.get(getKey(truncatePath(number)));
     const isLast = number === position.actions.length;
     const chip = createElement("span", { className: "rating" });
-    drawRating(chip, number ? (known?.rating ?? "") : "");
-    const text = known?.text ?? describeAction(position.actions[number - 1]);
+    drawRating(chip, number ? (label?.rating ?? "") : "");
+    const text = label?.text ?? describeAction(position.actions[number - 1]);
     const button = createElement("button", { type: "button", onclick: () => backTo(number) },
       createElement("small", {}, String(number)), ` ${text} `, chip); // prettier-ignore
     if (isLast) button.setAttribute("aria-current", "step");
@@ -459,9 +459,9 @@ function drawTrail() {
  * @param {string} role
  * @param {any[]} images
  * @param {(step: number) => void} choose
- * @param {number} last step that can be chosen
+ * @param {number} last last control step that can be chosen
  */
-function strip(role, images, choose, last) {
+function drawStrip(role, images, choose, last) {
   replaceImages(byRole(role), images.map((image, number) => {
     const step = frames.steps[number];
     const seconds = ((step / hello.stride) * hello.seconds_per_step).toFixed(1);
@@ -471,8 +471,8 @@ function strip(role, images, choose, last) {
   })); // prettier-ignore
 }
 
-/** @param {string} role of a strip @param {number} step whose frame is chosen */
-function mark(role, step) {
+/** @param {string} role of a strip @param {number} step control step of the frame to mark; below 0: no frame */
+function markFrame(role, step) {
   const buttons = /** @type {HTMLElement[]} */ ([...byRole(role).children]);
   for (const button of buttons) button.removeAttribute("aria-current");
   const chosen = buttons.filter((item) => step >= 0 && Number(item.dataset.step) <= step).pop();
@@ -482,13 +482,13 @@ function mark(role, step) {
 
 /** @param {Header} header @param {number[]} action the centre of the maps */
 function drawMaps(header, action) {
-  const had = document.activeElement?.closest(".map");
-  const [which, cell] = had ? [[...byRole("maps").children].indexOf(had), /** @type {any} */ (document.activeElement).dataset.cell] : [-1, ""];
+  const focusedMap = document.activeElement?.closest(".map"); // the focus moves to the same cell of the new map
+  const [mapIndex, cell] = focusedMap ? [[...byRole("maps").children].indexOf(focusedMap), /** @type {any} */ (document.activeElement).dataset.cell] : [-1, ""];
   byRole("maps").classList.remove("outdated");
-  byRole("maps").replaceChildren(...header.maps.map((/** @type {any} */ item) => energyMap(item, action)));
+  byRole("maps").replaceChildren(...header.maps.map((/** @type {any} */ item) => createEnergyMap(item, action)));
   const lowest = Math.min(...header.maps.flatMap((/** @type {any} */ item) => item.energy.flat()));
   byRole("maps-text").textContent = `Energy ${formatNumber(header.energy_now)} at the current frame, ${formatNumber(lowest)} after the best action (outlined). Click a cell to execute its action.`;
-  if (which >= 0) byRole("maps").children[which]?.querySelector(`[data-cell="${cell}"]`)?.focus();
+  if (mapIndex >= 0) byRole("maps").children[mapIndex]?.querySelector(`[data-cell="${cell}"]`)?.focus();
 }
 
 /**
@@ -497,7 +497,7 @@ function drawMaps(header, action) {
  * @param {any} map
  * @param {number[]} action
  */
-function energyMap(map, action) {
+function createEnergyMap(map, action) {
   const cells = map.energy.flatMap((/** @type {number[]} */ row, /** @type {number} */ up) =>
     row.map((energy, across) => {
       const numbers = [...action];
@@ -569,14 +569,14 @@ function setUp(header) {
     ...hello.episodes.map(({ name, full }, /** @type {number} */ value) => createElement("option", { value, title: full }, name)),
   );
   for (const element of document.querySelectorAll(".of-pose")) /** @type {any} */ (element).hidden = !hello.is_pose;
-  setUpPictures();
+  setUpViews();
   setUpMoves();
   setUpSliders();
   frames = { episode: -1, steps: [] };
   restore();
 }
 
-function setUpPictures() {
+function setUpViews() {
   const models = hello.models;
   const figures = [...models, { id: "truth", label: "ground truth" }].map(({ id, label }) => {
     const figure = byRole("image-template").content.firstElementChild.cloneNode(true);
@@ -593,17 +593,17 @@ function setUpPictures() {
   setViewMode(byRole("switch").getAttribute("aria-pressed") === "true" && models.length > 1);
 }
 
-/** @param {boolean} isSwitch whether only item model is shown */
-function setViewMode(isSwitch) {
+/** @param {boolean} isSingle whether only one model is shown */
+function setViewMode(isSingle) {
   const models = hello.models;
-  models.forEach(({ id }, /** @type {number} */ number) => (getView(id).hidden = isSwitch && number !== shownModel));
-  byRole("images").dataset.columns = String(isSwitch ? 2 : models.length + 1);
-  byRole("switch").setAttribute("aria-pressed", String(isSwitch));
-  byRole("compare").setAttribute("aria-pressed", String(!isSwitch));
+  models.forEach(({ id }, /** @type {number} */ number) => (getView(id).hidden = isSingle && number !== shownModel));
+  byRole("images").dataset.columns = String(isSingle ? 2 : models.length + 1);
+  byRole("switch").setAttribute("aria-pressed", String(isSingle));
+  byRole("compare").setAttribute("aria-pressed", String(!isSingle));
 }
 
 function showNextModel() {
-  if (hello.models.length < 2) return showMessage("There is only item model. Add another item with --against.");
+  if (hello.models.length < 2) return showMessage("There is only one model. Add another model with --against.");
   if (byRole("switch").getAttribute("aria-pressed") === "true") shownModel = (shownModel + 1) % hello.models.length;
   setViewMode(true);
   showMessage(`Model ${hello.models[shownModel].label} is shown. Press T for the next model.`);
@@ -625,21 +625,21 @@ function getStepGroup(axis) {
 }
 
 function setUpSliders() {
-  /** @param {string} name @param {any} unit @param {number} low @param {number} most @param {number} now */
-  const slider = (name, unit, low, most, now) => {
+  /** @param {string} name @param {any} unit @param {boolean} isSigned @param {number} max @param {number} value */
+  const createSlider = (name, unit, isSigned, max, value) => {
     const step = 10 ** -getDigits(unit);
-    const input = createElement("input", { type: "range", min: low ? -most : step, max: most, step, value: now, data: { name } });
+    const input = createElement("input", { type: "range", min: isSigned ? -max : step, max, step, value, data: { name } });
     const output = createElement("output");
-    input.oninput = () => (output.textContent = formatValue(Number(input.value) / unit.factor, unit, Boolean(low)));
+    input.oninput = () => (output.textContent = formatValue(Number(input.value) / unit.factor, unit, isSigned));
     input.oninput();
     return { input, row: createElement("label", {}, createElement("span", {}, name), input, output) };
   };
   const limit = (/** @type {any} */ item) => Number((Math.max(item.most, 2 * item.step) * item.factor).toFixed(getDigits(item)));
   const groups = new Map(hello.action.map((/** @type {any} */ item, /** @type {number} */ axis) => [getStepGroup(axis), item]));
-  const steps = [...groups].map(([name, item]) => ({ name, ...slider(name, item, 0, limit(item), item.step * item.factor) }));
+  const steps = [...groups].map(([name, item]) => ({ name, ...createSlider(name, item, false, limit(item), item.step * item.factor) }));
   sizes = new Map(steps.map(({ name, input }) => [name, input]));
   byRole("sizes").replaceChildren(...steps.map(({ row }) => row));
-  const free = hello.action.map((/** @type {any} */ item) => slider(item.name, item, -1, limit(item), 0));
+  const free = hello.action.map((/** @type {any} */ item) => createSlider(item.name, item, true, limit(item), 0));
   sliders = free.map((/** @type {any} */ item) => item.input);
   byRole("sliders").replaceChildren(...free.map((/** @type {any} */ item) => item.row));
   byRole("custom-action").open = !hello.is_pose;
@@ -666,7 +666,7 @@ addEventListener("keydown", (event) => {
   const key = event.key.toLowerCase();
   if (!(key in shortcuts) && !(key in KEYS)) return;
   event.preventDefault();
-  if (event.repeat && (numQueued || isPlaying)) return; // while a key is held, an action is executed after each answer
+  if (event.repeat && (numQueued || isPlaying)) return; // a held key commands the next action after the previous one is shown
   if (key in shortcuts) shortcuts[key]();
   else move(KEYS[key]);
 });

@@ -4,8 +4,8 @@
 /** @typedef {{kind: string, seq: number | null, images: {name: string, bytes: number, alt: string}[]}} Common */
 /** @typedef {Common & {[key: string]: any}} Header of a message; its kind determines the further fields */
 /** @typedef {Map<string, HTMLImageElement>} Images decoded images by name */
-/** @typedef {{header: Header, images: Images}} Answer */
-/** @typedef {{kind: string, fields: object, seq: number, settle: (answer: Answer | Error | null) => void}} Request */
+/** @typedef {{header: Header, images: Images}} Reply */
+/** @typedef {{kind: string, fields: object, seq: number, settle: (reply: Reply | Error | null) => void}} Request */
 /** @typedef {{display_unit: string, factor: number}} Unit displayed unit of a number */
 
 const SEARCHES = new Set(["energy", "plan"]); // requests that are cancelled by a newer request
@@ -14,21 +14,21 @@ const LAST_RETRY_MS = 5000;
 
 /**
  * A websocket that reconnects. One request is processed at a time, and only the newest request of each kind is queued.
- * A newer request cancels a running search. Answers are passed on in order, after their images are decoded.
+ * A newer request cancels a running search. Replies are passed on in order, after their images are decoded.
  */
 export class Wire {
   #socket = /** @type {WebSocket | null} */ (null);
   #running = /** @type {Request | null} */ (null);
   #waiting = /** @type {Request[]} */ ([]);
-  #order = Promise.resolve();
+  #received = Promise.resolve();
   #seq = 0;
   #retry = FIRST_RETRY_MS;
   #timer = 0;
 
   /**
    * @param {string} path of the socket, relative to the page
-   * @param {{received: (answer: Answer) => void, progress: (header: Header) => void, disconnected: (reason: string) => void}} events
-   *   received: a message without a request, first `hello` after each connection; disconnected: the connection was
+   * @param {{received: (reply: Reply) => void, progress: (header: Header) => void, disconnected: (reason: string) => void}} events
+   *   received: a message without a request, the first one after connecting is `hello`; disconnected: the connection was
    *   lost and is retried automatically
    */
   constructor(path, events) {
@@ -45,14 +45,14 @@ export class Wire {
     this.#socket = socket;
     socket.binaryType = "arraybuffer";
     socket.onmessage = ({ data }) => {
-      this.#order = this.#order.then(() => (socket === this.#socket ? this.#take(data) : undefined));
+      this.#received = this.#received.then(() => (socket === this.#socket ? this.#receive(data) : undefined));
     };
     socket.onclose = ({ reason }) => {
       if (socket !== this.#socket) return;
-      const unanswered = this.#running ? [this.#running, ...this.#waiting] : this.#waiting;
+      const pending = this.#running ? [this.#running, ...this.#waiting] : this.#waiting;
       this.#running = null;
       this.#waiting = [];
-      for (const request of unanswered) request.settle(null);
+      for (const request of pending) request.settle(null);
       this.events.disconnected(reason);
       this.#timer = setTimeout(() => this.connect(), this.#retry);
       this.#retry = Math.min(2 * this.#retry, LAST_RETRY_MS);
@@ -65,20 +65,20 @@ export class Wire {
    *
    * @param {string} kind
    * @param {object} fields
-   * @returns {Promise<Answer | null>}
+   * @returns {Promise<Reply | null>}
    */
   send(kind, fields) {
     if (this.#socket?.readyState !== WebSocket.OPEN) return Promise.resolve(null);
     return new Promise((resolve, reject) => {
-      /** @param {Answer | Error | null} answer */
-      const settle = (answer) => (answer instanceof Error ? reject(answer) : resolve(answer));
+      /** @param {Reply | Error | null} reply */
+      const settle = (reply) => (reply instanceof Error ? reject(reply) : resolve(reply));
       for (const older of this.#waiting.filter((request) => request.kind === kind)) older.settle(null);
       this.#waiting = [...this.#waiting.filter((request) => request.kind !== kind), { kind, fields, seq: 0, settle }];
-      this.#next();
+      this.#sendNext();
     });
   }
 
-  #next() {
+  #sendNext() {
     if (!this.#waiting.length || (this.#running && !SEARCHES.has(this.#running.kind))) return;
     this.#running?.settle(null);
     const request = /** @type {Request} */ (this.#waiting.shift());
@@ -88,33 +88,33 @@ export class Wire {
   }
 
   /** @param {ArrayBuffer} data */
-  async #take(data) {
+  async #receive(data) {
     const { header, buffer } = parseMessage(data);
     const isOutdated = () => header.seq !== null && header.seq !== this.#running?.seq;
     if (isOutdated()) return;
     if (header.kind === "progress") return this.events.progress(header);
-    /** @type {Answer | Error} */
-    let answer;
+    /** @type {Reply | Error} */
+    let reply;
     try {
-      answer = header.kind === "error" ? new Error(header.text) : { header, images: await decodeImages(header, buffer) };
+      reply = header.kind === "error" ? new Error(header.text) : { header, images: await decodeImages(header, buffer) };
     } catch {
-      answer = new Error("An image of the answer could not be decoded.");
+      reply = new Error("An image from the server could not be decoded.");
     }
     if (isOutdated()) return; // a newer request was sent while the images were decoded
     if (header.seq === null) {
       this.#retry = FIRST_RETRY_MS;
-      if (!(answer instanceof Error)) this.events.received(answer);
+      if (!(reply instanceof Error)) this.events.received(reply);
       return;
     }
     const request = this.#running;
     this.#running = null;
-    request?.settle(answer);
-    this.#next();
+    request?.settle(reply);
+    this.#sendNext();
   }
 }
 
 /**
- * @param {ArrayBuffer} data 4 bytes: length of the header; the header; the images
+ * @param {ArrayBuffer} data length of the header in 4 bytes, the header, the images
  * @returns {{header: Header, buffer: ArrayBuffer}}
  */
 function parseMessage(data) {
@@ -156,7 +156,7 @@ export function replaceImage(element, image) {
 }
 
 /**
- * Return the element with a role in the page, or within another element.
+ * Return the element with the attribute `data-role` in the page, or within another element.
  *
  * @param {string} role
  * @param {ParentNode} within
@@ -182,7 +182,7 @@ export function createElement(tag, { data = {}, ...properties } = {}, ...childre
 }
 
 /**
- * Create a shape of an SVG.
+ * Create an SVG element.
  *
  * @param {string} tag
  * @param {{[name: string]: string | number}} values of its attributes
@@ -198,12 +198,12 @@ export function createShape(tag, values) {
  *
  * @param {number | null} value
  * @param {Unit} unit
- * @param {boolean} signed
+ * @param {boolean} isSigned whether positive numbers begin with +
  */
-export function formatValue(value, unit, signed = false) {
+export function formatValue(value, unit, isSigned = false) {
   if (value === null) return "–";
   const text = Math.abs(value * unit.factor).toFixed(getDigits(unit));
-  const sign = value < 0 && Number(text) !== 0 ? "−" : signed ? "+" : "";
+  const sign = value < 0 && Number(text) !== 0 ? "−" : isSigned ? "+" : "";
   return `${sign}${text}${unit.display_unit && unit.display_unit !== "°" ? " " : ""}${unit.display_unit}`;
 }
 
