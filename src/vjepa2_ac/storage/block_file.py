@@ -173,7 +173,7 @@ class DiskCache:
         self.write(key, b"".join([*table, *parts]))
 
     def read_parts(self, key: str, count: int, numbers: Sequence[int]) -> list[bytes] | None:
-        """Read and return the parts `numbers` of an entry with `count` parts; None if the entry is absent or damaged."""
+        """Read and return the parts `numbers` of an entry of `count` parts; None if the entry is absent or damaged."""
         path = self._path(key)
         try:
             with path.open("rb", buffering=0) as file:
