@@ -54,5 +54,5 @@ def test_model_without_states_from_training_to_export(
     with torch.no_grad():
         expected = run.world_model.eval().predict(latents, actions, states)
         torch.testing.assert_close(loaded.predict(latents, actions, states), expected, atol=1e-5, rtol=1e-5)
-    with pytest.raises(InputError, match=r"Meta's code has no other.* --to merged"):
+    with pytest.raises(InputError, match=r"the only widths that Meta's code supports.* --to merged"):
         export_run(folder, tmp_path / "official.pt", "official")

@@ -2,9 +2,9 @@
 
 In block-causal attention a token of step t attends to all tokens of steps up to t. If there are more keys than queries,
 the queries belong to the last steps. There are three exact implementations:
-    dense     one attention with a mask: the reference
-    per_step  one attention per step, on the keys up to this step, without a mask: about half the computation
-    flex      FlexAttention with a block mask, compiled: for training on CUDA
+    dense     one call with a mask: the reference
+    per_step  one call per step, on the keys up to this step, without a mask: about half the computation
+    flex      compiled FlexAttention with a block mask: for training on CUDA
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ THETA = 10_000
 
 @dataclass(frozen=True)
 class TokenLayout:
-    """Layout of a sequence: `steps` steps, each of `conditioning` tokens and then `grid` x `grid` patches."""
+    """Layout of a sequence: `steps` steps, each of `conditioning` tokens followed by `grid` x `grid` patches."""
 
     steps: int
     grid: int
     conditioning: int = 0
     start: int = 0  # position in time of the first step
     interleaved: bool = False  # V-JEPA 2.1: both numbers of a pair have the same frequency
-    scaled_to: int | None = None  # V-JEPA 2.1: positions of any grid are scaled to those of a grid of this size
+    scaled_to: int | None = None  # V-JEPA 2.1: row and column positions are scaled to a grid of this size
 
     @property
     def tokens_per_step(self) -> int:
@@ -42,7 +42,7 @@ class TokenLayout:
 
 
 class RotaryTables(NamedTuple):
-    """Tables with which every layer rotates queries and keys; float32, because bfloat16 would round positions."""
+    """Tables for the rotation of queries and keys in every layer; float32, because bfloat16 would round positions."""
 
     cosine: Float32[Tensor, "sequence 1 head_dim"]
     signed_sine: Float32[Tensor, "sequence 1 head_dim"]  # sines, negated for the first number of each pair
@@ -61,7 +61,7 @@ def rotary_tables(layout: TokenLayout, head_dim: int, device: torch.device) -> R
     for V-JEPA 2.1 @ 204698b, app/vjepa_2_1/models/utils/modules.py.
     """
     part = 2 * ((head_dim // 3) // 2)
-    # Tables made in inference mode or under FakeTensor must not end up in the cache of a training run.
+    # A training run cannot use tensors that were created in inference mode, and the tables are cached.
     with torch.inference_mode(False), torch.no_grad():
         positions = _token_positions(layout, device)
         frequencies = 1.0 / THETA ** (torch.arange(part // 2, dtype=torch.float32, device=device) / (part / 2))
@@ -81,7 +81,7 @@ def rotate(
 
 
 class _Rotation(torch.autograd.Function):
-    """The rotation of pairs, in two passes over the tokens; the gradient is the inverse rotation, saving no tokens."""
+    """The rotation of pairs in two passes over the tokens. Its gradient is the inverse rotation and needs no tokens."""
 
     @staticmethod
     def forward(ctx: Any, tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
@@ -95,8 +95,8 @@ class _Rotation(torch.autograd.Function):
 
 
 def _rotate_pairs(tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
-    # `out` lets addcmul compute in float32 and write in the data type of the tokens, without a further pass for a cast.
-    # A compiler fuses this pass by itself. In compiled code torch 2.11 loses the gradient of a tensor that an
+    # With `out`, addcmul computes in float32 and writes the data type of the tokens, without another pass for the cast.
+    # A compiler fuses the cast itself. In compiled code torch 2.11 loses the gradient of a tensor that an
     # autograd.Function writes in place and returns (PyTorch issue 180642), even after a cast that changes nothing.
     if torch.compiler.is_compiling():
         rotated = torch.addcmul(tokens * cosine, _swap_pairs(tokens), signed_sine)
@@ -138,12 +138,12 @@ def block_causal_attention(
 ) -> Float[Tensor, "batch heads sequence head_dim"]:
     """Return the attention in which a token of step t attends to all tokens of steps <= t.
 
-    `auto` uses `flex` on CUDA if Triton is installed, gradients are enabled and there are at least four steps,
-    otherwise `per_step`. The reason is that FlexAttention is compiled again for each length and number of clips, and
-    lengths vary in evaluation and planning. `kind` may also be a function that computes the attention.
+    `auto` uses `flex` on CUDA if Triton is installed, gradients are enabled and there are at least four steps;
+    otherwise it uses `per_step`. FlexAttention is compiled again for each length and number of clips, and lengths vary
+    in evaluation and planning. `kind` may also be a function that computes the attention.
 
     Raises:
-        InputError: FlexAttention was compiled for too many sizes; uncompiled it would hold all scores in memory.
+        InputError: FlexAttention was compiled for too many sizes; uncompiled it would store all scores in memory.
     """
     if kind == "auto":
         is_long = query.shape[-1] >= _FLEX_HEAD_DIM and query.shape[2] // tokens_per_step >= _FLEX_STEPS
@@ -161,15 +161,15 @@ def _dense(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> T
 def _per_step(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
     num_cached = key.shape[2] - query.shape[2]
     ends = tuple(range(num_cached + tokens_per_step, key.shape[2] + 1, tokens_per_step))
-    parts = torch.split(query, tokens_per_step, dim=2)
+    queries = torch.split(query, tokens_per_step, dim=2)
     prefixes: Callable[..., tuple[Tensor, ...]] = _Prefixes.apply
-    steps = zip(parts, prefixes(key, ends), prefixes(value, ends), strict=True)
+    steps = zip(queries, prefixes(key, ends), prefixes(value, ends), strict=True)
     outputs = [scaled_dot_product_attention(*inputs) for inputs in steps]
     return outputs[0] if len(outputs) == 1 else torch.cat(outputs, dim=2)
 
 
 class _Prefixes(torch.autograd.Function):
-    """The prefixes of keys or values up to each end, as views without copies.
+    """The keys (or values) before each end, as views without copies.
 
     With plain slices, the gradient of each prefix would be padded with zeros to the full length before the gradients
     are added. Here each gradient is added in place.

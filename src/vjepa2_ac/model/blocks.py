@@ -14,11 +14,11 @@ from vjepa2_ac.model.compilation import When, compile_function
 
 NORM_EPSILON = 1e-6
 INIT_STD = 0.02
-_COMPILE_OFF = "training.compile=off (planning.compile=off)"  # the settings without compilation, for messages
+_COMPILE_OFF = "training.compile=off (planning.compile=off)"  # the settings that disable compilation, for messages
 
 
 class OutputLinear(nn.Linear):
-    """A linear layer whose output is added to the residual; its initial std is divided by sqrt(2 * layer).
+    """A linear layer whose output is added to the residual; its initial weights get smaller with depth (`output_std`).
 
     Args:
         inputs: Width of the input.
@@ -32,7 +32,7 @@ class OutputLinear(nn.Linear):
 
 
 class Attention(nn.Module):
-    """The layers of block-causal attention. Queries, keys and values get the same data type, which SDPA requires."""
+    """The linear layers of block-causal attention; attention itself is computed by `block_causal_attention`."""
 
     def __init__(self, width: int, heads: int, layer: int) -> None:
         super().__init__()
@@ -72,8 +72,8 @@ class Mlp(nn.Module):
 class Block(nn.Module):
     """A pre-norm transformer block: attention, then an MLP.
 
-    A block has no state, because gradient checkpointing computes it twice: keys and values of earlier steps are
-    arguments, and those for later steps are returned.
+    A block stores no keys and values, because gradient checkpointing computes it twice. Keys and values of earlier
+    steps are arguments, and keys and values for later steps are returned.
 
     Args:
         layer: Number of the block, counted from 1.
@@ -104,15 +104,16 @@ class Block(nn.Module):
             tokens_per_step: Number of tokens per step.
             kind: The implementation of attention.
             keep: Number of tokens whose keys (rotated) and values are returned.
-            past: Keys and values from earlier calls, in their order; the tokens follow them and attend to them. They
-                are separate arguments, because gradient checkpointing handles only tensors among its arguments.
+            past: Keys and values from earlier calls, in the order of the calls. The tokens follow them and attend to
+                them. They are not passed as a tuple, because gradient checkpointing finds only tensors that are
+                arguments themselves.
         """
         before, after = _before_attention, _after_attention
         if self.compiled == "always" or (self.compiled == "with gradients" and torch.is_grad_enabled()):
             before = compile_function(before, override=_COMPILE_OFF)
             after = compile_function(after, override=_COMPILE_OFF)
         query, key, value = before(self, tokens, tables)
-        # A copy, so that the memory of all other keys and values can be freed.
+        # `stack` copies, so the memory of all other keys and values can be freed.
         saved = torch.stack((key[:, :, :keep], value[:, :, :keep])) if keep else None
         if past:
             key, value = torch.cat((*past, torch.stack((key, value))), dim=3)
@@ -136,7 +137,7 @@ def initialise(module: nn.Module, generator: Generator | None = None) -> None:
 
 
 def output_std(layer: int) -> float:
-    """Return the initial standard deviation of a block's output layer, with blocks counted from 1."""
+    """Return the initial standard deviation of a block's output layers, 0.02 / sqrt(2 * layer); blocks count from 1."""
     return INIT_STD / math.sqrt(2 * layer)
 
 
@@ -150,7 +151,7 @@ def _after_attention(block: Block, tokens: Tensor, attended: Tensor) -> Tensor:
 
 
 def apply_norm(norm: nn.LayerNorm, tokens: Tensor) -> Tensor:
-    """Return normalised tokens, cast once to the data type of all following layers."""
+    """Return normalised tokens. Under autocast they are cast once, instead of in each of the following layers."""
     device_type = tokens.device.type
     if not torch.is_autocast_enabled(device_type):
         return norm(tokens)  # type: ignore[no-any-return]  # nn.Module is untyped
@@ -159,10 +160,10 @@ def apply_norm(norm: nn.LayerNorm, tokens: Tensor) -> Tensor:
 
 
 def without_needless_autocast(tokens: Tensor, weights: Tensor) -> AbstractContextManager[object]:
-    """Disable autocast if tokens and weights have its data type already.
+    """Return a context that disables autocast if tokens and weights already have autocast's data type.
 
-    Autocast would then compute norms from a float32 copy, and each following layer would cast the result back. Norm
-    kernels compute in float32 in any case, so that the result is the same with a fifth of the memory traffic.
+    Autocast would compute norms from a float32 copy, and each following layer would cast the result back. Norm kernels
+    compute in float32 in any case, so the result without autocast is the same, with a fifth of the memory traffic.
     """
     device_type = tokens.device.type
     if torch.is_autocast_enabled(device_type) and tokens.dtype == weights.dtype == torch.get_autocast_dtype(
@@ -173,12 +174,12 @@ def without_needless_autocast(tokens: Tensor, weights: Tensor) -> AbstractContex
 
 
 def hidden_width(width: int, mlp_ratio: float) -> int:
-    """Return the hidden width of an MLP: rounded down, as upstream does."""
+    """Return the hidden width of an MLP, rounded down as in Meta's code."""
     return int(width * mlp_ratio)
 
 
 def find_mlp_ratio(width: int, hidden: int, expected: float) -> float:
-    """Return a ratio for which `hidden_width` returns `hidden`: the expected ratio, if possible."""
+    """Return a ratio for which `hidden_width` returns `hidden`; the expected ratio if it is one."""
     if hidden_width(width, expected) == hidden:
         return expected
     exact = hidden / width

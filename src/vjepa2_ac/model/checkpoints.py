@@ -1,8 +1,8 @@
 """Load the base model of a config, and read and write all checkpoint formats.
 
-Supported are Meta's `.pt` of both families, a transformers folder, also from the Hub, and a folder of this project. An
-encoder in any format is described by `EncoderSource`, from which a network is filled. Tensors that do not match the
-network are errors.
+The supported formats are Meta's `.pt` of V-JEPA 2 and 2.1, a transformers folder (local or on the Hub), and a folder of
+this project. `EncoderSource` describes an encoder in any of these formats before its weights are read. Tensors that do
+not match the network are errors.
 """
 
 from __future__ import annotations
@@ -49,30 +49,31 @@ from vjepa2_ac.storage.transfer import download_from_hub
 logger = logging.getLogger(__name__)
 
 ENCODER_KEYS = ("ema_encoder", "target_encoder", "encoder")
-"""Keys of encoders in a file; the first of them that the file contains is used. Meta uses an average of the weights;
-`encoder` contains the weights that were trained by gradient descent."""
+"""Keys of encoders in a file of Meta, in order of preference. The first two contain a moving average of the weights,
+which Meta uses; `encoder` contains the weights that were trained by gradient descent."""
 FIX = "`vjepa2-ac download --list` shows the published files; the Hub has facebook/vjepa2-vitl-fpc64-256"
 
 Part = Family | Literal["predictor"]  # parts of a model that differ in the names of their tensors
 Rename = Callable[[str], tuple[str, int | None]]
-"""Our name of a tensor -> name in the file, and which third of a fused tensor it is (None: the whole tensor)."""
+"""Maps this project's name of a tensor to its name in the file, and to its index in a fused q, k, v tensor of the file
+(None: the tensor is not fused)."""
 
 _PARTS = (
     'both parts, as written by torch.save({"encoder": ..., "predictor": ...}, FILE),'
     " or model.encoder.path for the encoder"
 )
 _NEEDED = "a checkpoint of V-JEPA 2, 2.1 or 2-AC as Meta publishes it"
-_SPLIT = ("q", "k", "v")
+_FUSED = ("q", "k", "v")  # order of the parts of a fused tensor
 # Prefixes of DDP and of Meta's wrapper are at the start of a name; torch.compile's prefix can be inside.
 _PREFIXES = re.compile(r"^(?:(?:module|backbone|_orig_mod)\.)+|_orig_mod\.")
-_IGNORED = "pos_embed"  # may be in a file, but a network with rotary positions does not use it
+_UNUSED = "pos_embed"  # may be in a file, but a network with rotary positions does not use it
 _ENCODER = [
     (r"^vit\.embeddings\.patch_embeddings\.", "patch_embed."),
     (r"^vit\.layer\.", "blocks."),
     (r"\.attention\.(q|k|v)(?:uery|ey|alue)\.", r".attn.\1."),
     (r"\.attention\.proj\.", ".attn.proj."),
 ]
-_NAMES: dict[Part, list[tuple[str, str]]] = {  # our name -> Meta's, as (pattern, replacement), applied in this order
+_NAMES: dict[Part, list[tuple[str, str]]] = {  # (pattern, replacement) from this project's names to Meta's, in order
     "v2": [(r"^vit\.layernorm\.", "norm."), *_ENCODER],
     "v2.1": [
         (r"^vit\.layernorm\.", "norms_block.3."),
@@ -88,14 +89,14 @@ _HUB_PATTERNS = [CONFIG, "*.safetensors"]
 _HUB_PREFIXES = ("vjepa2.encoder.", "encoder.")  # of a classification model and of a plain model
 _BLOCK = re.compile(r"(?:^|\.)(?:blocks|layer)\.(\d+)\.")  # matches the names of Meta, transformers and this project
 _V2_1_PREFIXES = ("norms_block.", "video_mod_embed", "img_mod_embed", "patch_embed_img.")
-_NON_COMMERCIAL = "Such weights from jepa-wms have the licence CC-BY-NC 4.0: for non-commercial use only"
+_NON_COMMERCIAL = "If they are from jepa-wms, their licence is CC-BY-NC 4.0: for non-commercial use only"
 
 
 def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
     """Return the base model on the CPU.
 
-    The model is read from `model.base`. For `random` it has a new predictor of the sizes in `model.sizes`, and the
-    encoder in `model.encoder` or else a random encoder.
+    The model is read from `model.base`. With `model.base: random` it has a new predictor with the sizes in
+    `model.sizes`, and the encoder in `model.encoder`; without `model.encoder` the encoder is random, too.
 
     Raises:
         InputError: The model or the encoder does not exist, cannot be read, or contradicts the config.
@@ -111,7 +112,7 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
     path = find_base(config.base)
     file = None if path.is_dir() else MetaFile.open(path)
     if encoder is not None and (file is None or any(key in file.parts for key in ENCODER_KEYS)):
-        problem = f"a model with an encoder, and model.encoder sets another one ({encoder.where})"
+        problem = f"a model with an encoder, but model.encoder sets another encoder ({encoder.where})"
         fix = "Remove model.encoder; or train a new predictor on that encoder, with model.base: random"
         raise InputError(where=f"model.base: {config.base}", found=problem, fix=fix)
     if file is not None:
@@ -138,7 +139,7 @@ def base_sizes(config: ModelConfig) -> ModelSizes:
 
 
 def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torch.dtype = torch.float32) -> WorldModel:
-    """Load Meta's checkpoint. Every tensor must match, except a `pos_embed` of the encoder.
+    """Load a world model from Meta's checkpoint. Every tensor must match, except a `pos_embed` of the encoder.
 
     The file is memory-mapped: in addition to the weights in `dtype`, memory contains only pages of the file, which the
     system can free. If the file contains several encoders, the first of `ENCODER_KEYS` is used, because Meta's code
@@ -146,29 +147,30 @@ def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torc
 
     Args:
         path: The `.pt` file.
-        sizes: Sizes that the tensors do not determine: image size, heads, extrinsics. Any other size must be the
+        sizes: Sizes that the tensors do not determine: image size, heads, extrinsics. Every other size must be the
             default or equal the size of the tensors.
         dtype: Data type of the weights in memory.
 
     Raises:
-        InputError: The file is missing, truncated, of another kind, contradicts the sizes, or a weight is not finite.
+        InputError: The file is missing, is truncated, has another format or contradicts the sizes, or a weight is not
+            finite.
     """
     return _load_meta_file(MetaFile.open(Path(path)), None, sizes or ModelSizes(), dtype)
 
 
 def to_official(model: WorldModel) -> dict[str, Any]:
-    """Return the weights in the format of an official checkpoint: with Meta's names, and q, k and v fused.
+    """Return the weights of a model in the format of Meta's checkpoint: with Meta's names, and q, k and v fused.
 
     Raises:
-        InputError: Meta's code does not support the widths of states and actions, or a predictor without states.
+        InputError: Meta's code does not support the model's widths of states and actions, or a model without states.
         ValueError: The model has an adapter, which must be merged first.
     """
     if model.predictor is not model.base_predictor:
         raise ValueError("the model has an adapter: call merge_adapter first")
     if not model.sizes.predictor.use_states or get_model_widths(model.sizes) != POSE_WIDTHS:
         problem = f"a model with {describe_model_widths(model.sizes)}"
-        needed = f"states and actions of {POSE_WIDTHS.state} numbers: Meta's code has no other predictor"
-        fix = "Export it with --to merged (WorldModel.save_pretrained), which `model.base` takes"
+        needed = f"states and actions of {POSE_WIDTHS.state} numbers, the only widths that Meta's code supports"
+        fix = "Export it with --to merged (WorldModel.save_pretrained); `model.base` accepts this format"
         raise InputError(where="the official format", found=problem, needed=needed, fix=fix)
     encoder = to_official_names(model.loaded_encoder.state_dict(), model.sizes.encoder.family)
     return {
@@ -182,7 +184,7 @@ def to_official(model: WorldModel) -> dict[str, Any]:
 def _load_meta_file(
     file: MetaFile, encoder: EncoderSource | None, configured: ModelSizes, dtype: torch.dtype
 ) -> WorldModel:
-    """Return a model with the predictor in a file and an encoder; if it is None, with the encoder in the file."""
+    """Return a model with the predictor in a file, and with `encoder` or (if None) the encoder in the same file."""
     source = encoder or find_encoder_in_file(file, None, configured.encoder.frame, configured.encoder.heads)
     predictor = file.tensors("predictor")
     if "mask_tokens" in {name.partition(".")[0] for name in predictor} and "action_encoder.weight" not in predictor:
@@ -204,10 +206,10 @@ def _load_meta_file(
         model.encoder_origin = None  # the encoder and the predictor are from the same file
         return model
     if not model.sizes.predictor.use_states:
-        logger.warning("%s: a predictor without states and without an encoder. %s", file.path, _NON_COMMERCIAL)
+        logger.warning("%s: weights of a predictor without states. %s", file.path, _NON_COMMERCIAL)
     logger.warning(
-        "%s does not record the encoder of its predictor. If it is not %s, the predictions are noise: compare the error"
-        " of the first validation with persistence.",
+        "%s does not record the encoder on which its predictor was trained. If it was not %s, the predictions are"
+        " noise: compare the error of the first validation with persistence.",
         file.path,
         encoder.origin,
     )
@@ -215,7 +217,7 @@ def _load_meta_file(
 
 
 def _build_with_encoder(source: EncoderSource, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
-    """Return a model with this encoder, and a predictor without weights."""
+    """Return a model with this encoder and with a predictor on the meta device, which has no weights yet."""
     model = WorldModel.empty(sizes)
     fix = f"Get the original file. {FIX}"
     load_weights(model.loaded_encoder, source.weights(), source.rename, dtype, where=source.where, fix=fix)
@@ -228,7 +230,7 @@ def _build_with_encoder(source: EncoderSource, sizes: ModelSizes, dtype: torch.d
 def _merge_sizes(
     file: MetaFile, predictor: Mapping[str, Tensor], encoder: EncoderSource, configured: ModelSizes
 ) -> ModelSizes:
-    """Return the sizes of the tensors; heads, image size and extrinsics are taken from `configured`."""
+    """Return the model sizes that the tensors determine; heads, image size and extrinsics are from `configured`."""
     predictor_config = configured.predictor
     try:
         width, hidden = len(predictor["action_encoder.weight"]), len(predictor["predictor_blocks.0.mlp.fc1.weight"])
@@ -249,7 +251,7 @@ def _merge_sizes(
         },
     }
     fix = "Set image size and heads in model.sizes: the tensors do not determine them"
-    sizes = parse_record(ModelSizes, fields, where=str(file.path), needed="sizes that go with model.sizes", fix=fix)
+    sizes = parse_record(ModelSizes, fields, where=str(file.path), needed="sizes that fit model.sizes", fix=fix)
     check_sizes(sizes, configured, where=str(file.path))
     return sizes
 
@@ -261,14 +263,14 @@ def _merge_sizes(
 class EncoderSource:
     """An encoder in a file or folder, whose weights are not read yet."""
 
-    where: str  # for messages
+    where: str  # the file and key, for messages
     sizes: EncoderSizes
     patch_size: int
-    image_size: int | None  # in the last phase of training, if it is known
+    image_size: int | None  # in the last phase of training; None if it is unknown
     origin: EncoderOrigin
-    weights: Callable[[], Mapping[str, Tensor]]  # memory-mapped, by their names in the file
+    weights: Callable[[], Mapping[str, Tensor]]  # returns memory-mapped tensors by their names in the file
     rename: Rename
-    is_truncated: bool = False  # whether the last blocks are removed; the last norm then has no trained weights
+    is_truncated: bool = False  # whether the last blocks are removed; then the last norm has no trained weights
 
     def truncate(self, layer: int) -> EncoderSource:
         """Return the same encoder without the blocks after a layer.
@@ -278,8 +280,8 @@ class EncoderSource:
         """
         depth = self.sizes.depth
         if layer > depth:
-            needed = f"at most {depth}, its number of blocks"
-            raise InputError(where="model.encoder.layer", found=f"{layer}, of {self.where}", needed=needed)
+            needed = f"at most {depth}, the number of blocks"
+            raise InputError(where="model.encoder.layer", found=f"{layer}, for {self.where}", needed=needed)
         if layer == depth:
             return self
 
@@ -291,7 +293,7 @@ class EncoderSource:
 
 
 def find_encoder(config: EncoderConfig) -> EncoderSource:
-    """Find the encoder of a config without reading its weights; download it first if it is on the Hub.
+    """Find the encoder of a config without reading the weights; an encoder on the Hub is downloaded first.
 
     Raises:
         InputError: The encoder does not exist, has another format, is damaged, or contradicts the config.
@@ -305,7 +307,7 @@ def find_encoder(config: EncoderConfig) -> EncoderSource:
         name = config.path if path is None else path.name
         source = _find_encoder_in_folder(folder, config, name=name)
     if config.heads not in {None, source.sizes.heads}:
-        problem = f"{source.sizes.heads} attention heads, and model.encoder.heads is {config.heads}"
+        problem = f"{source.sizes.heads} attention heads, but model.encoder.heads is {config.heads}"
         raise InputError(where=source.where, found=problem, fix="Remove model.encoder.heads")
     return source if config.layer is None else source.truncate(config.layer)
 
@@ -323,14 +325,15 @@ def get_sizes_with_encoder(source: EncoderSource, configured: ModelSizes) -> Mod
     check_sizes(sizes, configured, where=source.where)
     if source.image_size not in {None, configured.image_size}:
         logger.warning(
-            "%s was trained at %d px, and frames are encoded at %d px (image_size), at untrained positions",
+            "%s was trained with frames of %d px, but frames are encoded at %d px (image_size), where positions are"
+            " untrained",
             source.origin, source.image_size, configured.image_size,
         )  # fmt: skip
     return sizes
 
 
 def get_expected_sizes(config: EncoderConfig, configured: ModelSizes) -> ModelSizes:
-    """Return the sizes of a model with this encoder; for a published file that is not downloaded yet, from its name.
+    """Return the sizes of a model with this encoder, which may be a published file that is not downloaded yet.
 
     Raises:
         InputError: See `find_encoder`.
@@ -352,17 +355,17 @@ def find_encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, head
         file: The file.
         key: The key of the encoder; None: the first of `ENCODER_KEYS` in the file.
         frame: How a frame is encoded.
-        heads: Number of attention heads, for an encoder whose width is not that of a published one.
+        heads: Number of attention heads; used only if no published encoder has the width of this encoder.
 
     Raises:
-        InputError: There is no such key, its value is not an encoder, or the number of heads is not known.
+        InputError: The file has no such key, the value is not an encoder, or the number of heads is unknown.
     """
     available = [name for name in ENCODER_KEYS if name in file.parts]
     if key is None and available:
         key = available[0]
-        logger.info("%s: the encoder under %s (there are: %s)", file.path, key, ", ".join(available))
+        logger.info("%s: using the encoder %s (available: %s)", file.path, key, ", ".join(available))
     if key not in available:
-        fix = f"Set model.encoder.key to one of {', '.join(available)}, or leave it out" if available else FIX
+        fix = f"Set model.encoder.key to one of {', '.join(available)}, or remove it" if available else FIX
         raise file.missing_error(key or "encoder", fix)
     tensors = file.tensors(key)
     family: Family = "v2.1" if any(name.startswith(_V2_1_PREFIXES) for name in tensors) else "v2"
@@ -373,10 +376,8 @@ def find_encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, head
         raise file.missing_error(f"tensor {missing}", part=key) from None
     heads = PUBLISHED_HEADS.get(width, heads)
     if heads is None:
-        problem = f"an encoder of width {width}, which no published encoder has: its number of heads is not known"
-        fix = (
-            "Set model.encoder.heads to the number used in its training; a wrong number causes wrong latents, no error"
-        )
+        problem = f"an encoder of width {width}, which no published encoder has: its number of heads is unknown"
+        fix = "Set model.encoder.heads to the number used in training; a wrong number gives wrong latents, not an error"
         raise InputError(where=str(file.path), found=problem, fix=fix)
     published = find_published_file(file.path.name)
     return EncoderSource(
@@ -398,7 +399,7 @@ def find_encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, head
 
 
 class _TransformersConfig(BaseModel):
-    """The fields of the config.json of a V-JEPA 2 model of transformers, with the values that are supported."""
+    """The config.json of a V-JEPA 2 model of transformers: the fields that are read, with the supported values."""
 
     model_type: Literal["vjepa2"]
     hidden_size: Width
@@ -415,11 +416,11 @@ class _TransformersConfig(BaseModel):
 
 
 def _find_encoder_in_folder(folder: Path, config: EncoderConfig, *, name: str) -> EncoderSource:
-    """Return the encoder in a folder of transformers or of this project; `name` is the value from the config."""
+    """Return the encoder in a folder of transformers or of this project; `name` is stored as its origin."""
     card = read_json_object(folder / CONFIG, needed=ENCODER_NEEDED, fix=FIX)
     if config.key is not None:
-        problem = f"{name}, a folder, which contains one encoder"
-        raise InputError(where=f"model.encoder.key: {config.key}", found=problem, fix="Remove the key")
+        problem = f"{name} is a folder, which contains only one encoder"
+        raise InputError(where=f"model.encoder.key: {config.key}", found=problem, fix="Remove model.encoder.key")
     if card.get("format") != FORMAT:
         return _find_transformers_encoder(folder, card, config.frame, name)
     model = read_sizes(folder)
@@ -429,14 +430,14 @@ def _find_encoder_in_folder(folder: Path, config: EncoderConfig, *, name: str) -
         patch_size=model.patch_size,
         image_size=model.image_size,
         origin=read_encoder_origin(folder)
-        or EncoderOrigin(name, has_heads_in_fingerprint=False),  # the fingerprint stays that of the model in the folder
+        or EncoderOrigin(name, has_heads_in_fingerprint=False),  # keeps the fingerprint of the model in the folder
         weights=partial(_map_safetensors, [folder / ENCODER]),
         rename=lambda ours: (ours, None),
     )
 
 
 def _find_transformers_encoder(folder: Path, card: Mapping[str, Any], frame: FramePath, name: str) -> EncoderSource:
-    """Return the encoder of a plain or a classification model of transformers, without masked predictor and head."""
+    """Return the encoder of a plain or a classification model of transformers; other parts are ignored."""
     fields = parse_record(_TransformersConfig, card, where=str(folder / CONFIG), needed=ENCODER_NEEDED, fix=FIX)
     tensors = _map_safetensors(sorted(folder.glob("*.safetensors")))
     prefix = next((text for text in _HUB_PREFIXES if any(name.startswith(text) for name in tensors)), None)
@@ -461,7 +462,7 @@ def _find_transformers_encoder(folder: Path, card: Mapping[str, Any], frame: Fra
 
 
 def _map_safetensors(files: list[Path]) -> dict[str, Tensor]:
-    """Return the memory-mapped tensors of safetensors files; values are read when they are used."""
+    """Return the memory-mapped tensors of safetensors files; values are read on use."""
     tensors: dict[str, Tensor] = {}
     for path in files:
         with open_safetensors(path, needed=ENCODER_NEEDED) as file:
@@ -477,14 +478,14 @@ class MetaFile:
     """A memory-mapped checkpoint of Meta."""
 
     path: Path
-    parts: Mapping[str, Any]  # by its keys
+    parts: Mapping[str, Any]  # the values in the file (weights, optimizer state, epoch) by their keys
 
     @classmethod
     def open(cls, path: Path) -> MetaFile:
         """Memory-map a file, without reading tensor values or executing code.
 
         Raises:
-            InputError: There is no such file, or it has another format, is truncated, a git-lfs pointer or a pipe.
+            InputError: The file does not exist, has another format, is truncated, or is a git-lfs pointer or a pipe.
             UnreachableError: The file cannot be read.
         """
         with storage.translate_read_errors(path, needed=_NEEDED, fix=FIX):
@@ -500,62 +501,62 @@ class MetaFile:
         return cls(path, {str(key): value for key, value in content.items()})
 
     def tensors(self, key: str) -> dict[str, Tensor]:
-        """Return the tensors of a part by Meta's names without prefixes.
+        """Return the tensors of a part by Meta's names, without the prefixes of wrappers.
 
         Raises:
-            InputError: There is no such part, or it is empty or contains other values than tensors.
+            InputError: The part does not exist, is empty, or contains other values than tensors.
         """
         part = self.parts.get(key)
         if not isinstance(part, dict) or not part or not all(isinstance(value, Tensor) for value in part.values()):
             raise self.missing_error(key if key not in self.parts else f"weights under {key!r}")
-        named = {_PREFIXES.sub("", str(name)): value for name, value in part.items()}
-        named.pop(_IGNORED, None)
-        require_floats(named, where=f"{self.path}: {key}", fix=FIX)
-        return named
+        tensors = {_PREFIXES.sub("", str(name)): value for name, value in part.items()}
+        tensors.pop(_UNUSED, None)
+        require_floats(tensors, where=f"{self.path}: {key}", fix=FIX)
+        return tensors
 
     def missing_error(self, name: str, fix: str = FIX, *, part: str | None = None) -> InputError:
-        """Return the error for a missing part, or a missing tensor in a part, with the names that exist."""
+        """Return the error for a missing part, or a missing tensor in `part`; its message lists existing names."""
         names = ", ".join(list(self.parts if part is None else self.tensors(part))[:8])
         problem = f"no {name} (keys: {names})" if part is None else f"no {name} in {part} (its tensors: {names})"
         return InputError(where=str(self.path), found=problem, needed=_PARTS, fix=fix)
 
 
 def to_official_name(name: str, part: Part) -> tuple[str, int | None]:
-    """Return Meta's name of one of our tensors, and which third of a fused tensor it is (None: the whole tensor)."""
+    """Return Meta's name of one of this project's tensors, and its index in a fused tensor; see `Rename`."""
     for pattern, replacement in _NAMES[part]:
         name = re.sub(pattern, replacement, name)
     fused = re.sub(r"\.attn\.[qkv]\.", ".attn.qkv.", name)
-    return fused, None if fused == name else _SPLIT.index(name.split(".attn.")[1][0])
+    return fused, None if fused == name else _FUSED.index(name.split(".attn.")[1][0])
 
 
 def load_weights(
     network: nn.Module, weights: Mapping[str, Tensor], rename: Rename, dtype: torch.dtype, *, where: str, fix: str
 ) -> None:
-    """Load memory-mapped weights into a network on the meta device, cast each when it is read, and freeze them.
+    """Load memory-mapped weights into a network on the meta device, cast each tensor when it is read, and freeze it.
 
     Raises:
-        InputError: A tensor is missing, unknown or of another shape, or a weight is not finite.
+        InputError: A tensor is missing or unknown or has another shape, or a weight is not finite.
     """
     state = network.state_dict()
-    names = {our_name: rename(our_name) for our_name in state}
+    names = {name: rename(name) for name in state}
     expected_shapes = {
-        file_name: state[our_name].shape if third is None else (3 * len(state[our_name]), *state[our_name].shape[1:])
-        for our_name, (file_name, third) in names.items()
+        file_name: state[name].shape if index is None else (3 * len(state[name]), *state[name].shape[1:])
+        for name, (file_name, index) in names.items()
     }
     check_tensors({name: value.shape for name, value in weights.items()}, expected_shapes, where=where, fix=fix)
     require_floats(weights, where=where, fix=fix)
-    for our_name, (file_name, third) in names.items():
-        value = weights[file_name] if third is None else weights[file_name].chunk(3)[third]
-        state[our_name] = value.to(dtype, copy=True)
+    for name, (file_name, index) in names.items():
+        value = weights[file_name] if index is None else weights[file_name].chunk(3)[index]
+        state[name] = value.to(dtype, copy=True)
     require_finite(state, where=where, fix=fix)
     network.load_state_dict(state, assign=True)
     network.requires_grad_(False)
 
 
 def to_official_names(weights: Mapping[str, Tensor], part: Part) -> dict[str, Tensor]:
-    """Return our weights with Meta's names, and q, k and v fused."""
+    """Return weights of this project with Meta's names, and with q, k and v fused."""
     parts_by_name: dict[str, list[Tensor]] = {}
-    for name, value in weights.items():  # q, k and v of a layer are in this order in every state_dict of ours
+    for name, value in weights.items():  # every state_dict of this project has q, k and v of a layer in this order
         parts_by_name.setdefault(to_official_name(name, part)[0], []).append(value.detach())
     return {
         f"module.{name}": parts[0] if len(parts) == 1 else torch.cat(parts) for name, parts in parts_by_name.items()
@@ -575,7 +576,7 @@ def count_blocks(names: Mapping[str, object], blocks: str) -> int:
 
 
 def _describe_unreadable_file(path: Path, error: Exception) -> tuple[str, str]:
-    """Describe a file that torch could not load, with its first bytes; return the description and the fix."""
+    """Return a description (with the first bytes) of a file that torch could not load, and the fix."""
     blocked = re.search(r"GLOBAL ([\w.]+)", str(error))
     if blocked:
         problem = f"a pickle that would call {blocked[1]}, which could execute code; it was not loaded"
@@ -584,7 +585,7 @@ def _describe_unreadable_file(path: Path, error: Exception) -> tuple[str, str]:
         )
         code = f'import torch; old = torch.load({old}, map_location="cpu", weights_only=False)'
         code += f"; torch.save({{key: old[key] for key in {keys} if key in old}}, {new})"
-        return problem, f"If you trust the file, save its weights alone: `python -c {shlex.quote(code)}`"
+        return problem, f"If you trust the file, extract its weights: `python -c {shlex.quote(code)}`"
     with path.open("rb") as file:
         first_bytes = file.read(24)
     reason = next(iter(str(error).splitlines()), type(error).__name__)[:120]

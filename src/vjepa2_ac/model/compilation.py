@@ -2,9 +2,9 @@
 
 Attention is not compiled here: SDPA is a single kernel, and FlexAttention is compiled separately (`attention`). The
 halves therefore depend neither on the keys of earlier steps, whose number grows with every step, nor on a mask. Weights
-are arguments, so that all blocks with the same kind of layers share one compilation. PyTorch compiles again if the
-number of tokens or clips changes (the new code then supports any number), if gradients are enabled or disabled, and if
-no layer before a block is trained.
+are arguments, so all blocks with the same kinds of layers share one compilation. PyTorch compiles again if the number
+of tokens or clips changes for the first time (the new code supports any number), if gradients are enabled or disabled,
+and if the tokens need no gradient because no earlier layer is trained.
 
 A failed compilation or recompilation is an error. PyTorch would continue with uncompiled code, which is slow for a
 block and makes FlexAttention store all attention scores in memory.
@@ -31,26 +31,26 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compile_function(function: Function, *, override: str, dynamic: bool | None = None) -> Function:
-    """Return the compiled function, the same object for all callers; compilation happens at the first call.
+    """Return the compiled function. It is compiled at its first call, and equal arguments return the same object.
 
     The compiled function raises `InputError` if it was already compiled for `MAX_VARIANTS` kinds of input.
 
     Args:
-        function: The function, compiled as one graph.
+        function: The function, which must be compilable as one graph.
         override: The setting that disables compilation, for the error message.
-        dynamic: False: compile for each size separately; None: PyTorch decides.
+        dynamic: False: every size is compiled separately; None: PyTorch decides.
     """
     return cast("Function", _compiled(function, BACKEND, override, dynamic))
 
 
 @lru_cache(maxsize=1)
 def has_triton() -> bool:
-    """Return whether Triton is installed, without which nothing is compiled for CUDA."""
+    """Return whether Triton is installed, which compilation for CUDA needs."""
     return importlib.util.find_spec("triton") is not None
 
 
 def describe_missing_compiler(device: str) -> str | None:
-    """Describe what this machine lacks for compilation on a device type (cpu or cuda); None if nothing is missing."""
+    """Describe what is missing on this machine for compilation on a device type (cpu or cuda); None if nothing is."""
     if device == "cuda" and not has_triton():
         return "Triton is not installed"
     variable, compilers = ("CC", ("gcc", "clang")) if device == "cuda" else ("CXX", ("g++", "clang++"))
@@ -63,7 +63,7 @@ def describe_missing_compiler(device: str) -> str | None:
 
 
 def require_compiler(device: str, *, where: str) -> None:
-    """Check that blocks can be compiled on a device type.
+    """Check that predictor blocks can be compiled for a device type.
 
     Args:
         device: The device type, cpu or cuda.

@@ -1,6 +1,6 @@
-"""Elementwise distances between latents, whose means are the loss, the energy of a plan and evaluation metrics.
+"""Elementwise distances between latents, whose means are losses, energies and evaluation metrics.
 
-Both are computed in float32. PyTorch is not imported.
+The distances are computed in float32. This module does not import PyTorch.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 def absolute_difference(
     predicted: Float[Tensor, "*predicted dim"], true: Float[Tensor, "*true dim"]
 ) -> Float[Tensor, "*broadcast dim"]:
-    """Return the absolute difference of each element; the mean is the L1 distance."""
+    """Return the absolute difference of each element; its mean is the L1 distance."""
     return (predicted.float() - true.float()).abs()
 
 
 def squared_difference(
     predicted: Float[Tensor, "*predicted dim"], true: Float[Tensor, "*true dim"]
 ) -> Float[Tensor, "*broadcast dim"]:
-    """Return the squared difference of each element; the mean is the mean squared error."""
+    """Return the squared difference of each element; its mean is the mean squared error."""
     return (predicted.float() - true.float()).square()

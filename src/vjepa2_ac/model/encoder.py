@@ -1,4 +1,4 @@
-"""The frozen encoder of V-JEPA 2 or 2.1: features of one frame at a time."""
+"""The frozen encoder of V-JEPA 2 or 2.1, which computes the features of single frames."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ with quiet_imports():
 ENCODE_CHUNK = 16  # frames per forward pass; limits the memory
 TUBELET = 2  # frames per tubelet; the encoder receives each frame twice
 _GRID_OF_POSITIONS = 16  # V-JEPA 2.1 scales the positions of any grid to those of 256 px
-_LEVELS = 4  # levels of V-JEPA 2.1, each with a norm; the norm of the last level is the last norm of the network
+_LEVELS = 4  # V-JEPA 2.1 normalises the outputs of four blocks; the last of these norms is that of the last block
 
 
 class Encoder(nn.Module):
-    """The frozen encoder of single frames to features, always in eval mode.
+    """The frozen network that encodes single frames, always in eval mode.
 
-    The network is the encoder of transformers' `VJEPA2Model`, without its masked predictor. Rotary tables are computed
-    once and in float32 (transformers computes angles in the data type of the weights), and patches are embedded by one
-    matrix product. V-JEPA 2.1 has other rotary positions, and adds a learned vector for the kind of input (video or
-    image) to every patch. Weights without influence on the output (norms of lower levels, the patch embedding of the
-    other kind) are loaded too, so that a checkpoint can be written again.
+    The network is the encoder of transformers' `VJEPA2Model`, without the masked predictor, with two changes. Rotary
+    tables are computed once and in float32 (transformers computes angles in the data type of the weights), and patches
+    are embedded by one matrix product. V-JEPA 2.1 has other rotary positions, and adds a learned vector for the kind of
+    input (video or image) to every patch. Weights that do not affect the output (norms of lower levels, the patch
+    embedding of the other kind of input) are loaded, too, because an exported checkpoint must contain them.
     """
 
     def __init__(self, sizes: ModelSizes) -> None:
@@ -50,7 +50,8 @@ class Encoder(nn.Module):
         self.vit.embeddings.patch_embeddings.proj = patches
         if not hasattr(VJEPA2RopeAttention, "apply_rotary_embeddings"):
             raise RuntimeError(
-                "this version of transformers rotates queries and keys elsewhere; 5.17 to 5.23 are tested"
+                "this version of transformers has no VJEPA2RopeAttention.apply_rotary_embeddings; 5.17 to 5.23 are"
+                " tested"
             )
         for block in self.vit.layer:
             block.attention = _ExactAttention(self.vit.config, layout)  # the names of the weights do not change
@@ -62,14 +63,14 @@ class Encoder(nn.Module):
     def forward(
         self, frames: Float[Tensor, "frames 3 height width"], chunk: int = ENCODE_CHUNK
     ) -> Float[Tensor, "frames tokens dim"]:
-        """Return the features of normalised frames in float32, before the layer normalisation of latents.
+        """Return the features of normalised frames in float32; `normalise_latents` turns them into latents.
 
         Args:
             frames: Frames normalised as in training.
             chunk: Number of frames per forward pass; limits the memory.
 
         Raises:
-            ValueError: The frames have another size than those of the model, so that the positions would be wrong.
+            ValueError: The size of the frames is not the model's image size; positions would be wrong.
         """
         if frames.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(
@@ -77,18 +78,18 @@ class Encoder(nn.Module):
                 f" {self.image_size} px (model.sizes.image_size)"
             )
         weight, features = next(self.vit.parameters()), list[Tensor]()
-        for part in torch.split(frames.to(weight.dtype), chunk):
-            tubelets = part[:, None].expand(-1, TUBELET, -1, -1, -1)
+        for frames_of_chunk in torch.split(frames.to(weight.dtype), chunk):
+            tubelets = frames_of_chunk[:, None].expand(-1, TUBELET, -1, -1, -1)
             with without_needless_autocast(tubelets, weight):
                 features.append(self.vit(tubelets).last_hidden_state)
         return torch.cat(features)
 
     def train(self, mode: bool = True) -> Encoder:  # noqa: ARG002  # the signature of nn.Module
-        """Keep eval mode, independently of the surrounding model."""
+        """Keep eval mode, whatever the mode of the surrounding model."""
         return super().train(False)
 
     def reset_last_norm(self) -> None:
-        """Reset the weights of the last norm, because the loaded weights belong to a later layer that was removed."""
+        """Reset the last norm after blocks were removed: its trained weights belong to the last block's output."""
         nn.init.ones_(self.vit.layernorm.weight)
         nn.init.zeros_(self.vit.layernorm.bias)
 
@@ -110,8 +111,7 @@ class Encoder(nn.Module):
 class _FramePatches(nn.Conv3d):
     """The patch embedding of tubelets of two identical frames, as a matrix product with the kernel summed over time.
 
-    The product needs half the arithmetic of the convolution. It does not depend on cuDNN, some versions of which have
-    no fast 3D convolution in bfloat16.
+    The product needs half the arithmetic of the 3D convolution, which is slow in bfloat16 with some versions of cuDNN.
     """
 
     def __init__(self, width: int, patch_size: int) -> None:
@@ -151,7 +151,7 @@ class _PatchesByKind(_FramePatches):
     def forward(
         self, tubelets: Float[Tensor, "frames 3 time height width"]
     ) -> Float[Tensor, "frames dim 1 rows columns"]:
-        """Return the patches of frames: as tubelets of identical frames, or as images."""
+        """Return the embedded patches of frames, encoded as tubelets of identical frames or as images."""
         if self.frame == "tubelet":
             return super().forward(tubelets) + self.video_kind.reshape(1, -1, 1, 1, 1)
         return self._embed(tubelets[:, :, 0], self.of_images) + self.image_kind.reshape(1, -1, 1, 1, 1)

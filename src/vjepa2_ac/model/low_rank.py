@@ -1,4 +1,4 @@
-"""Low-rank update of a frozen linear layer, computed within its matrix products. Needs only PyTorch."""
+"""The low-rank update of a frozen linear layer, computed with few passes over the tokens. Needs only PyTorch."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from torch.nn.functional import linear
 
 
 class LowRankLayer:
-    """A layer with a low-rank update whose two matrices can be cast for all micro-steps at once (`CastMatrices`)."""
+    """A layer with a low-rank update. `CastMatrices` can cast its two matrices once for all micro-steps."""
 
-    # Copies of the matrices in the data type of the arithmetic, within `CastMatrices.use`.
+    # Copies of the matrices in the data type of the computation; set within `CastMatrices.use`.
     cast: tuple[Tensor, Tensor] | None = None
 
     def matrices(self) -> tuple[Tensor, ...]:
@@ -30,14 +30,14 @@ def low_rank_linear(
     dropout: nn.Module | None,
     scale: float,
 ) -> Tensor:
-    """Return the output of a frozen layer and its update, computed in the data type of the tokens.
+    """Return the sum of the outputs of a frozen layer and its low-rank update, in the data type of the tokens.
 
     Args:
         tokens: The input.
         layer: The frozen layer.
-        update: The layer with the two matrices.
+        update: The object with the two matrices of the update.
         dropout: Dropout on the input of the update, or None.
-        scale: The scale of the update.
+        scale: The factor of the update.
     """
     dtype, matrices = tokens.dtype, update.matrices()
     cast: tuple[Tensor | None, ...]
@@ -52,11 +52,11 @@ def low_rank_linear(
 
 
 class CastMatrices:
-    """Copies of adapter matrices in the data type of the arithmetic, cast once per step instead of at each use.
+    """Copies of adapter matrices in the data type of the computation, cast once per step instead of at each use.
 
     Args:
         module: The module with the adapters.
-        dtype: The data type of the arithmetic.
+        dtype: The data type of the computation.
     """
 
     def __init__(self, module: nn.Module, dtype: torch.dtype) -> None:
@@ -88,11 +88,12 @@ class CastMatrices:
 
 
 class _LowRankLinear(torch.autograd.Function):
-    """`tokens @ weight.T + bias + scale * masked @ first.T @ second.T` with a frozen weight, all of one data type.
+    """`tokens @ weight.T + bias + scale * masked @ first.T @ second.T` with a frozen weight.
 
-    If the matrices have another data type, copies in this data type are passed as well and used for the computation;
-    the gradients have the data type of the matrices. Saved for the gradient are the adapter's input (masked, or the
-    tokens) and the values between its matrices; nothing for a frozen adapter.
+    `masked` are the tokens after dropout. All tensors have one data type, except that `first` and `second` may have
+    another one; then `first_cast` and `second_cast` are used for the computation, and the gradients of the matrices
+    have the matrices' own data type. Only what the required gradients need is saved: the adapter's input and the values
+    between its matrices, if the adapter is trained.
     """
 
     @staticmethod
@@ -114,21 +115,21 @@ class _LowRankLinear(torch.autograd.Function):
         inner = linear(adapter_input, first)
         result = linear(tokens, weight, bias)
         result = _add_product(result.flatten(0, -2), inner, second.T, scale).view_as(result)
-        needed = (ctx.needs_input_grad[4], ctx.needs_input_grad[5], ctx.needs_input_grad[0])
-        values = zip((adapter_input, inner, weight), needed, strict=True)
-        saved = (value if is_needed else None for value, is_needed in values)
-        ctx.save_for_backward(*saved, first, second)
+        # The gradients of `first`, `second` and `tokens` need the adapter's input, the inner values and the weight.
+        are_needed = (ctx.needs_input_grad[4], ctx.needs_input_grad[5], ctx.needs_input_grad[0])
+        values = zip((adapter_input, inner, weight), are_needed, strict=True)
+        ctx.save_for_backward(*(value if is_needed else None for value, is_needed in values), first, second)
         ctx.scale, ctx.is_masked = scale, masked is not None
         return result
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         adapter_input, inner, weight, first, second = ctx.saved_tensors
-        rows, shape = gradient.flatten(0, -2), (*gradient.shape[:-1], first.shape[1])
-        inner_gradient = rows @ second
+        flat_gradient, shape = gradient.flatten(0, -2), (*gradient.shape[:-1], first.shape[1])
+        inner_gradient = flat_gradient @ second
         tokens_gradient = masked_gradient = None
         if ctx.needs_input_grad[0]:
-            tokens_gradient = rows @ weight
+            tokens_gradient = flat_gradient @ weight
             if not ctx.is_masked:
                 tokens_gradient = _add_product(tokens_gradient, inner_gradient, first, ctx.scale)
             tokens_gradient = tokens_gradient.view(shape)
@@ -137,7 +138,7 @@ class _LowRankLinear(torch.autograd.Function):
         first_gradient = (
             None if adapter_input is None else (inner_gradient.T @ adapter_input * ctx.scale).to(ctx.matrix_dtype)
         )
-        second_gradient = None if inner is None else (rows.T @ inner * ctx.scale).to(ctx.matrix_dtype)
+        second_gradient = None if inner is None else (flat_gradient.T @ inner * ctx.scale).to(ctx.matrix_dtype)
         return tokens_gradient, masked_gradient, None, None, first_gradient, second_gradient, None, None, None
 
 
@@ -145,4 +146,4 @@ def _add_product(total: Tensor, left: Tensor, right: Tensor, scale: float) -> Te
     """Return `total + scale * left @ right`, computed in place unless a compiler traces the function."""
     if torch.compiler.is_compiling():  # torch 2.11 would lose the gradient of the result (PyTorch issue 180642)
         return torch.addmm(total, left, right, alpha=scale)
-    return torch.addmm(total, left, right, alpha=scale, out=total)  # PyTorch's FLOP counter knows this operation
+    return torch.addmm(total, left, right, alpha=scale, out=total)  # unlike addmm_, counted by PyTorch's FLOP counter

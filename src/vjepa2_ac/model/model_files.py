@@ -1,7 +1,7 @@
 """Find model files, read their sizes without reading weights, and download published files.
 
-PyTorch is not imported. An interrupted download resumes; a complete one is checked and then renamed.
-Sources: facebookresearch/vjepa2 @ 204698b, src/hub/backbones.py and app/vjepa_2_1/models; the models' cards on the Hub.
+This module does not import PyTorch. An interrupted download resumes. A complete download is checked and then renamed.
+Sources: facebookresearch/vjepa2 @ 204698b, src/hub/backbones.py and app/vjepa_2_1/models; model cards on the Hub.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ _FIX = "For a run, `vjepa2-ac export RUN FOLDER` writes one"
 
 
 def find_base(name: str) -> Path:
-    """Return the file or folder of `model.base`.
+    """Return the path of the file or folder in `model.base`.
 
     Raises:
-        InputError: It does not exist.
+        InputError: The path does not exist.
     """
     needed = f"the official .pt, a folder written by `vjepa2-ac export`, or {_TINY}"
     fix = "`vjepa2-ac download` fetches the official checkpoint to checkpoints/vjepa2-ac-vitg.pt"
@@ -48,10 +48,10 @@ def find_base(name: str) -> Path:
 
 
 def find_encoder_path(name: str) -> Path | None:
-    """Return the file or folder of `model.encoder.path`; None if it is on the Hub.
+    """Return the path of the file or folder in `model.encoder.path`; None if the encoder is on the Hub.
 
     Raises:
-        InputError: It does not exist.
+        InputError: The path does not exist.
     """
     if name.startswith(HUB):
         return None
@@ -129,7 +129,7 @@ def check_sizes(model_sizes: ModelSizes, config_sizes: ModelSizes, *, where: str
 
 
 def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
-    """Return the origin of the encoder in a model folder; None if it is not known, or was trained with the model.
+    """Return the origin of the encoder in a model folder; None if it is unknown or the model has its original encoder.
 
     Raises:
         InputError: The record of the origin is damaged.
@@ -145,7 +145,7 @@ def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
 
 @dataclass(frozen=True)
 class EncoderShape:
-    """A published encoder."""
+    """The architecture of a published encoder."""
 
     name: str  # such as ViT-B
     width: int
@@ -155,7 +155,7 @@ class EncoderShape:
 
     @property
     def parameters(self) -> int:
-        """The approximate number of weights: blocks and patch embedding, without biases and norms."""
+        """The approximate number of parameters: blocks and patch embedding, without biases and norms."""
         return self.depth * (4 * self.width**2 + 2 * self.width * self.hidden) + 2 * 3 * 16**2 * self.width
 
     def sizes(self, family: Family, frame: FramePath) -> EncoderSizes:
@@ -171,7 +171,7 @@ VIT_g = EncoderShape("ViT-g", 1408, 40, 22, 6144)
 VIT_G = EncoderShape("ViT-G", 1664, 48, 26, 8192)
 
 PUBLISHED_HEADS: Mapping[int, int] = {shape.width: shape.heads for shape in (VIT_B, VIT_L, VIT_H, VIT_g, VIT_G)}
-"""Width of an encoder -> number of attention heads, which tensors do not determine."""
+"""The number of attention heads by the width of an encoder. The shapes of tensors do not determine this number."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class EncoderOrigin:
     file: str  # name of the file or repository
     key: str = ""  # key of the weights in the file; "" for a folder
     licence: str = ""  # "" if it is not known
-    has_heads_in_fingerprint: bool = True  # whether the number of heads is part of the encoder's fingerprint
+    has_heads_in_fingerprint: bool = True  # whether an unpublished number of heads changes the encoder's fingerprint
 
     def as_dict(self) -> dict[str, str | bool]:
         """Return the origin as plain values, with the keys of config.json."""
@@ -211,9 +211,7 @@ class Published:
     encoder: EncoderShape
     image_size: int  # frame size in the last phase of training, in pixels
     key: str  # key of the encoder's weights in the file
-    gigabytes: (
-        float  # approximate file size; the file also contains an average of the weights and the optimizer's moments
-    )
+    gigabytes: float  # approximate file size, including averaged weights and the optimizer's moments
     bytes: int | None = None  # exact file size; None if it is not known
     licence: str = "MIT"  # the licence of Meta's repository, because the server sends none with the file
 
@@ -224,7 +222,7 @@ class Published:
 
     @property
     def family(self) -> Family:
-        """The family of its encoder."""
+        """The family of the file's encoder."""
         return "v2.1" if self.name.startswith("vjepa2.1") else "v2"
 
     @property
@@ -262,30 +260,30 @@ PUBLISHED: tuple[Published, ...] = (
 
 
 def find_published_file(file_name: str) -> Published | None:
-    """Return the published file with exactly this name, Meta's or ours; None if there is none."""
+    """Return the published file with this name (on Meta's server or after the download); None if there is none."""
     return next((published for published in PUBLISHED if file_name in {published.remote, published.file}), None)
 
 
 def find_published(text: str) -> Published:
-    """Return the published checkpoint with a name, given with or without `.pt`.
+    """Return the published checkpoint with a name.
 
     Args:
-        text: Our name, or Meta's name of the file.
+        text: The argument of `vjepa2-ac download`, or the name of the file on Meta's server; with or without `.pt`.
 
     Raises:
         InputError: No published checkpoint has this name.
     """
     name = text.removesuffix(".pt")
-    published = next((known for known in PUBLISHED if name in {known.name, known.remote.removesuffix(".pt")}), None)
+    published = next((entry for entry in PUBLISHED if name in {entry.name, entry.remote.removesuffix(".pt")}), None)
     if published is None:
         fix = "`vjepa2-ac download --list` shows all names; --to sets the path of the file"
-        raise InputError(where=f"download {text}", found="no published checkpoint of this name", fix=fix)
+        raise InputError(where=f"download {text}", found="no published checkpoint with this name", fix=fix)
     return published
 
 
 CHUNK_BYTES = 2**20
 _POLICY = RetryPolicy(attempts=5, first_wait_s=2.0, total_s=math.inf)
-_PROXY = "Check the URL, and whether a proxy answers in the server's place"
+_PROXY = "Check the URL, and whether a proxy answers instead of the server"
 
 
 def download(
@@ -296,25 +294,25 @@ def download(
     reporter: Reporter = SILENT,
     policy: RetryPolicy = _POLICY,
 ) -> Path:
-    """Download a file to `path`, and resume a partial download from an earlier call.
+    """Download a file to `path`, or resume the partial download of an earlier call.
 
     Args:
         url: The URL of the file.
         path: The path of the complete file, which exists only after the download has finished. An existing file is
             kept if it has the right size.
-        published: The published checkpoint, whose size is checked; None for any file.
+        published: The published checkpoint, whose size is checked; None for any other file.
         reporter: Receives the progress in megabytes.
-        policy: The number of consecutive attempts without a new byte, and the waits between them.
+        policy: The maximum number of consecutive attempts without progress, and the waits between attempts.
 
     Raises:
-        InputError: The server does not send the size of the file, or a size that the published file cannot have; the
-            disk has too little space; the path is not writable.
+        InputError: The server sends no size of the file, or a size that the published file cannot have; the disk has
+            too little space; the path is not writable.
         UnreachableError: The server refuses, or cannot be reached.
     """
     path = Path(path)
     with storage.translate_write_errors(path):
         if path.is_dir():
-            raise InputError(where=str(path), found="a folder", needed="the name of a file", fix="Name a file in it")
+            raise InputError(where=str(path), found="a folder", needed="the path of a file", fix="Add a file name")
         if path.exists():
             _require_size(published, _size(path), where=str(path))
             return path
@@ -338,7 +336,7 @@ def download(
 
 
 def _fetch(url: str, part: Path, published: Published | None, reporter: Reporter, timeout_s: float) -> None:
-    """Download the part of a file that is missing in `part`."""
+    """Download the rest of a file of which `part` contains the beginning."""
     start = _size(part)
     try:
         request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user sets the URL
@@ -363,7 +361,7 @@ def _fetch(url: str, part: Path, published: Published | None, reporter: Reporter
         free = storage.free_bytes(part.parent.absolute()) + _size(part)
         if total > free:
             needed = f"{total / 1e9:.4g} GB, of which {start / 1e9:.4g} GB are downloaded"
-            fix = "Free some space, or name a file on a larger disk with --to"
+            fix = "Free some space, or set --to to a file on a larger disk"
             raise InputError(where=str(part), found=f"{free / 1e9:.4g} GB free on its disk", needed=needed, fix=fix)
         report_progress = reporter.task(f"{part.name.removesuffix('.part')} (MB)")
         with storage.translate_write_errors(part), part.open("ab" if start else "wb") as file:
@@ -378,11 +376,11 @@ def _require_size(published: Published | None, size: int, *, where: str) -> None
     """Check the size of a file; an approximate size is sufficient to detect an error page from a proxy."""
     if published is None:
         return
-    bounds = [round(published.gigabytes * share * 10**9) for share in (1 - _TOLERANCE, 1 + _TOLERANCE)]
+    bounds = [round(published.gigabytes * factor * 10**9) for factor in (1 - _TOLERANCE, 1 + _TOLERANCE)]
     smallest, largest = bounds if published.bytes is None else (published.bytes, published.bytes)
     if not smallest <= size <= largest:
-        needed = f"{published.name}, of {smallest:,} to {largest:,} bytes"
-        fix = f"{_PROXY}; or delete the file, or name another with --to"
+        needed = f"{smallest:,} to {largest:,} bytes for {published.name}"
+        fix = f"{_PROXY}; or delete the file, or set --to to another path"
         raise InputError(where=where, found=f"a file of {size:,} bytes", needed=needed, fix=fix)
 
 

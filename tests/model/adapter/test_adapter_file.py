@@ -1,4 +1,4 @@
-"""Adapter files of unknown origin: converted to our config, or rejected by name of the option; never read by PEFT."""
+"""Untrusted adapter files are converted to this project's config, or rejected with the name of the option."""
 
 import json
 from collections.abc import Callable
@@ -42,10 +42,10 @@ def rewrite(folder: Path, changes: dict[str, Any], file: str = ADAPTER_FILE) -> 
 
 
 def test_saved_adapter_config_has_layer_names_instead_of_user_patterns(folder: Path) -> None:
-    read = parse_adapter_config(json.loads((folder / ADAPTER_FILE).read_text()), where="here")
+    saved = parse_adapter_config(json.loads((folder / ADAPTER_FILE).read_text()), where="here")
     ranks = {f"blocks.{index}.mlp.fc1": 6 for index in range(2)}
-    resolved = {"rank_pattern": ranks, "alpha_pattern": {"blocks.0.mlp.fc1": 3.5}}
-    assert read == CONFIG.model_copy(update={"targets": ("fc1", "q"), "peft": resolved})
+    patterns = {"rank_pattern": ranks, "alpha_pattern": {"blocks.0.mlp.fc1": 3.5}}
+    assert saved == CONFIG.model_copy(update={"targets": ("fc1", "q"), "peft": patterns})
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ def test_saved_adapter_config_has_layer_names_instead_of_user_patterns(folder: P
         ({"modules_to_save": ["blocks"]}, "modules_to_save.0: Input should be 'predictor_embed'"),
         ({"peft_type": "IA3"}, "an adapter with unsupported options: 'peft_type' 'IA3'"),
         ({"bias": "all"}, "an adapter with unsupported options: 'bias' 'all'"),
-        ({"use_of_the_future": 1}, "'use_of_the_future'"),
+        ({"use_future_option": 1}, "'use_future_option'"),
     ],
 )
 def test_unsupported_adapter_option_raises_with_its_name(
@@ -81,18 +81,18 @@ def test_unsupported_adapter_option_raises_with_its_name(
 
 
 def test_disabled_options_of_another_peft_version_are_ignored(fresh: Fresh, folder: Path) -> None:
-    later = {"peft_version": "9.9", "some_config": None, "use_it": False, "its_pattern": {}, "qalora_group_size": 16}
-    rewrite(folder, later)
+    options = {"peft_version": "9.9", "a_config": None, "use_option": False, "a_pattern": {}, "qalora_group_size": 16}
+    rewrite(folder, options)
     load_trained(fresh(), folder)
 
 
-@pytest.mark.parametrize("start", ["pissa", "loftq"])
-def test_initialisation_that_changes_the_base_weights_raises(start: str) -> None:
+@pytest.mark.parametrize("initialisation", ["pissa", "loftq"])
+def test_initialisation_that_changes_the_base_weights_raises(initialisation: str) -> None:
     with pytest.raises(ValidationError, match="changes the base weights"):
-        AdapterConfig(peft={"init_lora_weights": start})
+        AdapterConfig(peft={"init_lora_weights": initialisation})
 
 
-def test_peft_option_with_its_own_config_key_raises() -> None:
+def test_peft_option_that_has_a_config_key_raises() -> None:
     with pytest.raises(ValidationError, match=r"peft\.r: set adapter\.rank instead"):
         AdapterConfig(peft={"r": 4})
 

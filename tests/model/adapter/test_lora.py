@@ -1,4 +1,4 @@
-"""Properties of adapters: fresh, trained, disabled, saved, loaded and merged."""
+"""Properties of new, trained, disabled, saved, loaded and merged adapters."""
 
 import copy
 import json
@@ -31,7 +31,9 @@ Fresh = Callable[..., WorldModel]
 METHODS = {
     "lora": LORA,
     "dora": LORA.model_copy(update={"dora": True}),
-    "heads": LORA.model_copy(update={"targets": ("all",), "modules_to_save": ("action_encoder", "state_encoder")}),
+    "projections": LORA.model_copy(
+        update={"targets": ("all",), "modules_to_save": ("action_encoder", "state_encoder")}
+    ),
     "patterns": AdapterConfig(
         rank=4,
         alpha=8.0,
@@ -67,34 +69,34 @@ def train(model: WorldModel, inputs, steps: int = 3) -> None:
 
 @pytest.fixture(scope="module")
 def trained() -> Callable[..., WorldModel]:
-    """Return a copy of a model with trained weights; each kind is trained only once."""
+    """Return a function that returns a copy of a model with trained weights; each config is trained only once."""
     models: dict[tuple[str, torch.dtype], WorldModel] = {}
 
     def make(config: AdapterConfig, dtype: torch.dtype = torch.float32) -> WorldModel:
-        kind = config.model_dump_json(), dtype
-        if kind not in models:
-            models[kind] = tiny_model(dtype=dtype)
-            add_adapter(models[kind], config, seed=0)
-            train(models[kind], tiny_inputs())
-        return copy.deepcopy(models[kind])
+        key = config.model_dump_json(), dtype
+        if key not in models:
+            models[key] = tiny_model(dtype=dtype)
+            add_adapter(models[key], config, seed=0)
+            train(models[key], tiny_inputs())
+        return copy.deepcopy(models[key])
 
     return make
 
 
-def copies(model: WorldModel) -> dict[str, Tensor]:
+def copy_weights(model: WorldModel) -> dict[str, Tensor]:
     return {name: value.detach().clone() for name, value in model.named_parameters()}
 
 
 @both_types
 @every_method
-def test_fresh_adapter_leaves_predictions_unchanged(
+def test_new_adapter_leaves_predictions_unchanged(
     fresh: Fresh, inputs, config: AdapterConfig, dtype: torch.dtype
 ) -> None:
     model = fresh(dtype=dtype)
     before = predict(model, inputs)
     add_adapter(model, config, seed=0)
     after = predict(model.eval(), inputs)
-    if config.modules_to_save and dtype == torch.bfloat16:  # float32 arithmetic in the heads
+    if config.modules_to_save and dtype == torch.bfloat16:  # trained projections are float32
         torch.testing.assert_close(after, before, rtol=0, atol=0.1)
     else:
         assert torch.equal(after, before)
@@ -107,7 +109,7 @@ def test_training_changes_exactly_the_adapter_weights(
 ) -> None:
     model = fresh(dtype=dtype)
     add_adapter(model, config, seed=0)
-    before = copies(model)
+    before = copy_weights(model)
     train(model, inputs)
     for name, value in model.named_parameters():
         is_adapter = ".lora_" in name or ".modules_to_save." in name
@@ -118,11 +120,11 @@ def test_training_changes_exactly_the_adapter_weights(
 
 def test_full_fine_tuning_changes_all_predictor_weights_except_unused_extrinsics(model: WorldModel, inputs) -> None:
     add_adapter(model, FULL, seed=0)
-    before = copies(model)
+    before = copy_weights(model)
     train(model, inputs)
     for name, value in model.named_parameters():
-        trained = name.startswith("predictor.") and "extrinsics_encoder" not in name
-        assert torch.equal(value, before[name]) != trained, name
+        is_trained = name.startswith("predictor.") and "extrinsics_encoder" not in name
+        assert torch.equal(value, before[name]) != is_trained, name
 
 
 def adapted_layers(model: WorldModel) -> set[str]:
@@ -140,8 +142,10 @@ def adapted_layers(model: WorldModel) -> set[str]:
 )
 def test_target_set_adapts_its_layers(model: WorldModel, targets: tuple[str, ...], names: set[str]) -> None:
     add_adapter(model, LORA.model_copy(update={"targets": targets}), seed=0)
-    heads = {"predictor_embed", "predictor_proj", "action_encoder", "state_encoder"} if targets == ("all",) else set()
-    assert adapted_layers(model) == {f"blocks.{index}.{name}" for index in range(2) for name in names} | heads
+    expected = {f"blocks.{index}.{name}" for index in range(2) for name in names}
+    if targets == ("all",):
+        expected |= {"predictor_embed", "predictor_proj", "action_encoder", "state_encoder"}
+    assert adapted_layers(model) == expected
 
 
 @pytest.mark.parametrize(
@@ -169,15 +173,15 @@ def test_disabled_adapter_predicts_as_base_and_enabled_as_before(
 ) -> None:
     model = trained(config, dtype)
     base = predict(fresh(dtype=torch.float32 if config.kind == "none" else dtype), inputs)
-    before, adapted, count = copies(model), predict(model, inputs), trainable_report(model).trained
+    before, adapted, num_trained = copy_weights(model), predict(model, inputs), trainable_report(model).trained
     with use_base_weights(model):
         disabled = predict(model, inputs)
-    rounding = 0.05 if (config.kind, dtype) == ("none", torch.bfloat16) else 0  # float32 arithmetic on rounded weights
+    rounding = 0.05 if (config.kind, dtype) == ("none", torch.bfloat16) else 0  # float32 computation, rounded weights
     torch.testing.assert_close(disabled, base, rtol=0, atol=rounding)
     assert not torch.allclose(adapted, base, atol=0.05)
     assert torch.equal(predict(model, inputs), adapted)
     assert all(torch.equal(value, before[name]) for name, value in model.named_parameters())
-    assert trainable_report(model).trained == count
+    assert trainable_report(model).trained == num_trained
 
 
 @both_types
@@ -217,7 +221,7 @@ def test_merged_model_predicts_the_same_and_is_a_plain_model(
     model = trained(config, dtype)
     adapted = predict(model, inputs)
     merge_adapter(model)
-    rounding = 3e-5 if dtype == torch.float32 else 0.15  # of predictions near 1; PyTorch 2.11 rounds by 1.6e-5
+    rounding = 3e-5 if dtype == torch.float32 else 0.15  # predictions are near 1; PyTorch 2.11 rounds by 1.6e-5
     torch.testing.assert_close(predict(model, inputs), adapted, rtol=0, atol=rounding)
     assert type(model.predictor) is ActionConditionedPredictor
     assert {value.dtype for value in model.parameters()} == {dtype}

@@ -23,14 +23,14 @@ from vjepa2_ac.model.world_model import WorldModel
 
 FILES = GOLDEN / "encoders"
 V2, V21 = FILES / "vjepa2_pretrained.pt", FILES / "vjepa2_1_distilled.pt"
-PUBLISHED_HEADS = {V2: 3, V21: 4}
+NUM_HEADS = {V2: 3, V21: 4}
 
 
 class Golden(NamedTuple):
     path: Path
-    facts: dict[str, Any]
-    io: dict[str, Tensor]
-    is_newer: bool
+    facts: dict[str, Any]  # how the file was written, and the checked sizes
+    io: dict[str, Tensor]  # inputs and outputs of the official code
+    is_v21: bool
 
 
 @pytest.fixture(scope="module", params=[V2, V21], ids=["2", "2.1"])
@@ -42,10 +42,10 @@ def golden(request: pytest.FixtureRequest) -> Golden:
 
 def model_of(path: Path | str, size: int = 96, dtype: str = "float32", **encoder: Any) -> WorldModel:
     """Return a model with the encoder in a file, and a small new predictor."""
-    known = {"heads": PUBLISHED_HEADS[path]} if path in PUBLISHED_HEADS else {}
+    heads = {"heads": NUM_HEADS[path]} if path in NUM_HEADS else {}
     config = {
         "base": "random",
-        "encoder": {"path": str(path), **known, **encoder},
+        "encoder": {"path": str(path), **heads, **encoder},
         "sizes": {"image_size": size, "predictor": {"width": 24, "depth": 1, "heads": 2}},
         "dtype": dtype,
     }
@@ -80,12 +80,12 @@ def test_another_key_loads_another_encoder(golden: Golden) -> None:
 # All other file formats give the same latents.
 
 
-def as_plain(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    masked = {"predictor.embeddings.mask_tokens": torch.zeros(2, 3)}
-    return only_encoder(weights) | masked
+def rename_with_predictor(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return weights by transformers' names, with a tensor of the masked predictor, which must be ignored."""
+    return rename_encoder(weights) | {"predictor.embeddings.mask_tokens": torch.zeros(2, 3)}
 
 
-def only_encoder(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+def rename_encoder(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name.replace("vit.", "encoder.", 1): value for name, value in weights.items()}
 
 
@@ -94,14 +94,14 @@ CARD = {
     "crop_size": 96, "patch_size": 16, "tubelet_size": 2, "hidden_act": "gelu", "qkv_bias": True,
     "layer_norm_eps": 1e-06, "frames_per_clip": 64, "architectures": ["VJEPA2Model"],
 }  # fmt: skip
-Named = Callable[[dict[str, Tensor]], dict[str, Tensor]]
+Rename = Callable[[dict[str, Tensor]], dict[str, Tensor]]
 
 
-def write_transformers(folder: Path, named: Named = as_plain, shards: int = 1, **card: Any) -> Path:
+def write_transformers(folder: Path, rename: Rename = rename_with_predictor, shards: int = 1, **card: Any) -> Path:
     """Write the reference encoder of V-JEPA 2 in the format of transformers."""
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps(CARD | card))
-    weights = {name: value.clone() for name, value in named(dict(model_of(V2).encoder.state_dict())).items()}
+    weights = {name: value.clone() for name, value in rename(dict(model_of(V2).encoder.state_dict())).items()}
     if shards == 1:
         save_file(weights, folder / "model.safetensors", metadata={"format": "pt"})
         return folder
@@ -111,9 +111,9 @@ def write_transformers(folder: Path, named: Named = as_plain, shards: int = 1, *
     return folder
 
 
-@pytest.mark.parametrize(("named", "shards"), [(as_plain, 1), (as_plain, 3)])
-def test_transformers_folder_loads_the_same_encoder(tmp_path: Path, named: Named, shards: int) -> None:
-    model, original = model_of(write_transformers(tmp_path / "hf", named, shards)), model_of(V2)
+@pytest.mark.parametrize("shards", [1, 3])
+def test_transformers_folder_loads_the_same_encoder(tmp_path: Path, shards: int) -> None:
+    model, original = model_of(write_transformers(tmp_path / "hf", shards=shards)), model_of(V2)
     assert model.sizes == original.sizes
     assert model.encoder_fingerprint() == original.encoder_fingerprint()
     frames = load_file(V2.with_suffix(".io.safetensors"))["frames.96"][None]
@@ -124,15 +124,15 @@ def test_transformers_model_class_gives_equal_features(tmp_path: Path) -> None:
     """This confirms that the folder written by these tests has the format of transformers."""
     from transformers import VJEPA2Model
 
-    folder = write_transformers(tmp_path / "hf", only_encoder)
-    theirs = VJEPA2Model.from_pretrained(folder).eval()
+    folder = write_transformers(tmp_path / "hf", rename_encoder)
+    transformers_model = VJEPA2Model.from_pretrained(folder).eval()
     frames = load_file(V2.with_suffix(".io.safetensors"))["frames.96"]
     with torch.no_grad():
-        expected = theirs(frames[:, None].expand(-1, 2, -1, -1, -1), skip_predictor=True).last_hidden_state
+        expected = transformers_model(frames[:, None].expand(-1, 2, -1, -1, -1), skip_predictor=True).last_hidden_state
     assert_equal_to_rounding(model_of(folder).loaded_encoder(frames), expected)
 
 
-def test_encoder_on_the_hub_loads_also_from_the_cache_without_a_network(
+def test_encoder_on_the_hub_loads_from_the_cache_without_a_network(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from huggingface_hub import constants
@@ -158,7 +158,7 @@ def test_encoder_on_the_hub_loads_also_from_the_cache_without_a_network(
 def test_saved_folder_and_exported_official_file_load_the_same_encoder(
     golden: Golden, tmp_path: Path, frame: str
 ) -> None:
-    if frame == "image" and not golden.is_newer:
+    if frame == "image" and not golden.is_v21:
         return
     model = model_of(golden.path, frame=frame)
     model.save_pretrained(tmp_path / "model")
@@ -189,36 +189,33 @@ def test_exported_official_file_has_metas_name_for_every_tensor(golden: Golden) 
 # Wrong files and configs raise, with a fix.
 
 
-P = "module.backbone."
-
-
-def without_last_norm(content: dict[str, Any]) -> None:
+def remove_last_norm(content: dict[str, Any]) -> None:
     for kind in ("weight", "bias"):
-        del content["ema_encoder"][f"{P}norms_block.3.{kind}"]
+        del content["ema_encoder"][f"module.backbone.norms_block.3.{kind}"]
 
 
-def with_another_tensor(content: dict[str, Any]) -> None:
-    content["ema_encoder"][f"{P}cls_token"] = torch.zeros(1, 1, 64)
+def add_tensor(content: dict[str, Any]) -> None:
+    content["ema_encoder"]["module.backbone.cls_token"] = torch.zeros(1, 1, 64)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (without_last_norm, r"missing: norms_block\.3\.bias.*Get the original"),
-        (with_another_tensor, r"ema_encoder: 1 tensors do not match \(unexpected: cls_token\)"),
+        (remove_last_norm, r"missing: norms_block\.3\.bias.*Get the original"),
+        (add_tensor, r"ema_encoder: 1 tensors do not match \(unexpected: cls_token\)"),
         (lambda _: {"encoder": {"a": 1}}, "no weights under 'encoder'"),
         (lambda _: {"encoder": {"a": torch.zeros(1)}}, "no tensor 'patch_embed.proj.weight' in encoder"),
     ],
 )
 def test_incomplete_encoder_file_raises(tmp_path: Path, change: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        model_of(rewrite(V21, change, tmp_path / "changed.pt"), heads=PUBLISHED_HEADS[V21])
+        model_of(rewrite(V21, change, tmp_path / "changed.pt"), heads=NUM_HEADS[V21])
 
 
 @pytest.mark.parametrize(
     ("path", "encoder", "message"),
     [
-        (V21, {"heads": None}, "width 64, .*its number of heads is not known.*Set model.encoder.heads"),
+        (V21, {"heads": None}, "width 64, .*its number of heads is unknown.*Set model.encoder.heads"),
         (V21, {"heads": 5}, "64 is not a multiple of encoder.heads 5"),
         (V2, {"frame": "image"}, "image needs V-JEPA 2.1"),
         (V2, {"key": "ema_encoder"}, r"no ema_encoder .*Set model.encoder.key"),
@@ -243,7 +240,7 @@ def test_transformers_config_that_contradicts_the_tensors_raises(
     tmp_path: Path, card: dict[str, Any], message: str
 ) -> None:
     folder = write_transformers(tmp_path / "hf", **card)
-    if card == {"num_attention_heads": 4}:  # the tensors do not contradict it, so that only the fingerprint differs
+    if card == {"num_attention_heads": 4}:  # the tensors do not contradict this number; only the fingerprint differs
         assert model_of(folder).encoder_fingerprint() != model_of(V2).encoder_fingerprint()
         return
     with pytest.raises(InputError, match=message):
@@ -255,7 +252,7 @@ def test_pretraining_checkpoint_as_base_raises() -> None:
         load_base(ModelConfig(base=str(V21)), seed=0)
 
 
-def test_fingerprint_differs_if_latents_differ_with_equal_tensors() -> None:
+def test_encoders_with_equal_tensors_but_different_latents_have_different_fingerprints() -> None:
     original = model_of(V21).encoder_fingerprint()
     assert model_of(V21, frame="image").encoder_fingerprint() != original
     assert model_of(V21, heads=2).encoder_fingerprint() != original

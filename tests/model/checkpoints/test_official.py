@@ -25,8 +25,8 @@ from vjepa2_ac.model.world_model import WorldModel
 
 class Reference(NamedTuple):
     path: Path
-    facts: dict[str, Any]
-    io: dict[str, Tensor]
+    facts: dict[str, Any]  # sizes, losses and gradient norm of the official code
+    io: dict[str, Tensor]  # inputs, outputs and gradients of the official code
     sizes: ModelSizes
     model: WorldModel
 
@@ -47,20 +47,22 @@ def reference(request: pytest.FixtureRequest) -> Reference:
     return Reference(path, facts, load_file(path.with_suffix(".io.safetensors")), sizes, load_official(path, sizes))
 
 
-def predictions(reference: Reference) -> tuple[Tensor, Tensor, Tensor]:
+def predict_as_official(reference: Reference) -> tuple[Tensor, Tensor, Tensor]:
     """Return latents, teacher-forced predictions, and the rollout that starts with the first prediction."""
     io, model = reference.io, reference.model
     cameras = io.get("extrinsics")
-    z = model.encode(io["clips"].transpose(1, 2))
-    forced = model.predict(z[:, :-1], io["actions"], io["states"][:, :-1], None if cameras is None else cameras[:, :-1])
+    latents = model.encode(io["clips"].transpose(1, 2))
+    forced = model.predict(
+        latents[:, :-1], io["actions"], io["states"][:, :-1], None if cameras is None else cameras[:, :-1]
+    )
     steps = reference.facts["auto_steps"]
-    rolled = model.rollout(
-        torch.cat([z[:, :1], forced[:, :1]], dim=1),
+    rollout = model.rollout(
+        torch.cat([latents[:, :1], forced[:, :1]], dim=1),
         io["actions"][:, :steps],
         io["states"][:, :steps],
         None if cameras is None else cameras[:, :steps],
     )
-    return z, forced, torch.cat([forced[:, :1], rolled], dim=1)
+    return latents, forced, torch.cat([forced[:, :1], rollout], dim=1)
 
 
 def test_features_equal_the_official_values(reference: Reference) -> None:
@@ -76,29 +78,32 @@ def test_predictions_losses_and_gradients_equal_the_official_values(reference: R
     model.set_attention(attention)
     model.predictor.requires_grad_(True)
     model.zero_grad()
-    z, forced, rolled = predictions(reference)
+    latents, forced, rollout = predict_as_official(reference)
     assert_equal_to_rounding(forced.flatten(1, 2), io["z_tf"])
-    assert_equal_to_rounding(rolled.flatten(1, 2), io["z_ar"])
-    losses = [(part - z[:, 1 : part.shape[1] + 1]).abs().mean() for part in (forced, rolled)]
+    assert_equal_to_rounding(rollout.flatten(1, 2), io["z_ar"])
+    losses = [(steps - latents[:, 1 : steps.shape[1] + 1]).abs().mean() for steps in (forced, rollout)]
     assert losses[0].item() == pytest.approx(facts["loss_teacher_forcing"], rel=1e-5)
     assert losses[1].item() == pytest.approx(facts["loss_rollout"], rel=1e-5)
     (losses[0] + losses[1]).backward()
-    check_gradients(model, io, facts["predictor_grad_norm"])
+    assert_gradients_equal(model, io, facts["predictor_grad_norm"])
     model.predictor.requires_grad_(False)
 
 
-def check_gradients(model: WorldModel, io: dict[str, Tensor], norm: float) -> None:
-    fused: dict[str, dict[int | None, Tensor]] = {}
+def assert_gradients_equal(model: WorldModel, io: dict[str, Tensor], norm: float) -> None:
+    parts_by_name: dict[str, dict[int | None, Tensor]] = {}
     for name, value in model.predictor.named_parameters():
         if value.grad is not None:
-            official, third = to_official_name(name, "predictor")
-            fused.setdefault(official, {})[third] = value.grad
-    content = {n: g[None] if None in g else torch.cat([g[0], g[1], g[2]]) for n, g in fused.items()}
+            official, index = to_official_name(name, "predictor")
+            parts_by_name.setdefault(official, {})[index] = value.grad
+    gradients = {
+        name: parts[None] if None in parts else torch.cat([parts[0], parts[1], parts[2]])
+        for name, parts in parts_by_name.items()
+    }
     expected = {name.removeprefix("grad."): value for name, value in io.items() if name.startswith("grad.")}
     assert len(expected) >= 20
     for name, value in expected.items():
-        assert_equal_to_rounding(content[name], value)
-    total = torch.stack([gradient.norm() for gradient in content.values()]).norm().item()
+        assert_equal_to_rounding(gradients[name], value)
+    total = torch.stack([gradient.norm() for gradient in gradients.values()]).norm().item()
     assert total == pytest.approx(norm, rel=1e-5)
 
 
@@ -120,7 +125,7 @@ def rewritten(tmp_path: Path) -> Callable[[Callable[[Content], Any]], Path]:
     return lambda change: rewrite(GOLDEN / "model" / "tiny.pt", change, tmp_path / "changed.pt")
 
 
-def renamed(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def with_prefix(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {prefix + name.removeprefix("module."): value for name, value in weights.items()}
 
 
@@ -128,7 +133,7 @@ def renamed(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 def test_name_prefixes_and_an_unused_pos_embed_are_ignored(rewritten, prefix: str) -> None:
     def change(content: Content) -> None:
         for part in ("encoder", "target_encoder", "predictor"):
-            content[part] = renamed(content[part], prefix)
+            content[part] = with_prefix(content[part], prefix)
         content["target_encoder"][prefix + "pos_embed"] = torch.zeros(1, 16, 48)
 
     model = load_official(rewritten(change), TINY_SIZES)
@@ -140,8 +145,8 @@ def test_name_prefixes_and_an_unused_pos_embed_are_ignored(rewritten, prefix: st
 # Files with two encoders.
 
 
-def trained_encoder(content: Content) -> None:
-    """Add an encoder whose values differ slightly from those of the target encoder, as after training."""
+def change_trained_encoder(content: Content) -> None:
+    """Replace the encoder by one whose values differ slightly from the target encoder's, as after training."""
     generator = torch.Generator().manual_seed(1)
     content["encoder"] = {
         name: value * (1 + 0.01 * torch.randn(value.shape, generator=generator))
@@ -149,19 +154,19 @@ def trained_encoder(content: Content) -> None:
     }
 
 
-@pytest.mark.parametrize("change", [trained_encoder, lambda content: content.pop("encoder") and None])
+@pytest.mark.parametrize("change", [change_trained_encoder, lambda content: content.pop("encoder") and None])
 def test_target_encoder_is_used_with_or_without_another_encoder(rewritten, change: Callable[[Content], None]) -> None:
     expected = load_official(GOLDEN / "model" / "tiny.pt", TINY_SIZES)
     model = load_official(rewritten(change), TINY_SIZES)
     assert model.encoder_fingerprint() == expected.encoder_fingerprint()
 
 
-def rename_one(content: Content) -> None:
+def rename_norm(content: Content) -> None:
     for part in (content["encoder"], content["target_encoder"]):
         part["module.blocks.1.norm1.scale"] = part.pop("module.blocks.1.norm1.weight")
 
 
-def drop_head(content: Content) -> None:
+def remove_state_encoder(content: Content) -> None:
     del content["predictor"]["module.state_encoder.weight"]
 
 
@@ -169,15 +174,15 @@ def drop_head(content: Content) -> None:
     ("change", "message"),
     [
         (
-            rename_one,
+            rename_norm,
             r"encoder: 2 tensors do not match \(missing: blocks.1.norm1.weight; unexpected: blocks.1.norm1.scale\)",
         ),
-        (drop_head, r"predictor: 1 tensors do not match \(missing: state_encoder.weight\)"),
+        (remove_state_encoder, r"predictor: 1 tensors do not match \(missing: state_encoder.weight\)"),
         (lambda _: [1, 2], "changed.pt: a list. Expected a checkpoint of V-JEPA"),
         (lambda content: {"encoder": content["encoder"]}, r"no predictor \(keys: encoder\)\. Expected both parts"),
         (lambda content: content["predictor"], r"no encoder \(keys: module\.\w+\..*Expected both parts.*torch\.save\("),
         (
-            lambda content: content | {"predictor": renamed(content["predictor"], "model.")},
+            lambda content: content | {"predictor": with_prefix(content["predictor"], "model.")},
             r"no tensor 'action_encoder.weight' in predictor \(its tensors: model\.\w+\.",
         ),
     ],

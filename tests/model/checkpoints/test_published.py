@@ -18,16 +18,13 @@ from vjepa2_ac.storage.retries import RetryPolicy
 
 
 def test_every_published_file_is_found_by_each_of_its_unique_names() -> None:
-    assert (
-        len({published.file.casefold() for published in PUBLISHED})
-        == len({published.url for published in PUBLISHED})
-        == len(PUBLISHED)
-    )
+    local_names, urls = {published.file.casefold() for published in PUBLISHED}, {entry.url for entry in PUBLISHED}
+    assert len(local_names) == len(urls) == len(PUBLISHED)
     for published in PUBLISHED:
         for name in (published.name, published.file, published.remote, published.remote.removesuffix(".pt")):
             assert find_published(name) is published
         assert published in {find_published_file(published.file), find_published_file(published.remote)}
-    with pytest.raises(InputError, match=r"no published checkpoint of this name.*--list"):
+    with pytest.raises(InputError, match=r"no published checkpoint with this name.*--list"):
         find_published("VJEPA2_1_VITG_384")
 
 
@@ -36,7 +33,7 @@ MADE_UP = Published(
     "made-up", "elsewhere.pt", VIT_B, 384, "ema_encoder", 0.0001,
     bytes=102_400, licence="of the test",
 )  # fmt: skip
-twice, at_once = RetryPolicy(attempts=2, first_wait_s=0.0), RetryPolicy(first_wait_s=0.0)
+two_attempts, without_waits = RetryPolicy(attempts=2, first_wait_s=0.0), RetryPolicy(first_wait_s=0.0)
 PART = "made-up.pt.made-up.part"
 
 
@@ -45,7 +42,7 @@ class Behaviour:
     """The behaviour of a test server."""
 
     content: bytes = CONTENT
-    cut_after: list[int] = field(default_factory=list)  # number of bytes that each of the first requests gets
+    cut_after: list[int] = field(default_factory=list)  # number of bytes sent to each of the first requests
     errors: list[int] = field(default_factory=list)  # status codes of the first requests
     can_resume: bool = True  # whether the server supports Range requests
     sends_size: bool = True  # whether it sends Content-Length
@@ -57,7 +54,7 @@ def serve() -> Iterator[Callable[[Behaviour], str]]:
     servers: list[ThreadingHTTPServer] = []
 
     def start(behaviour: Behaviour) -> str:
-        server = ThreadingHTTPServer(("127.0.0.1", 0), handler_for(behaviour))
+        server = ThreadingHTTPServer(("127.0.0.1", 0), make_handler(behaviour))
         servers.append(server)
         threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
         return f"http://127.0.0.1:{server.server_port}/model.pt"
@@ -68,7 +65,7 @@ def serve() -> Iterator[Callable[[Behaviour], str]]:
         server.server_close()
 
 
-def handler_for(behaviour: Behaviour) -> type[BaseHTTPRequestHandler]:
+def make_handler(behaviour: Behaviour) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             match = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
@@ -111,7 +108,7 @@ def handler_for(behaviour: Behaviour) -> type[BaseHTTPRequestHandler]:
 def test_download_completes_after_interruptions(serve, tmp_path: Path, part, behaviour, starts) -> None:
     if part:
         (tmp_path / "model.pt.part").write_bytes(part)
-    assert download(serve(behaviour), tmp_path / "model.pt", policy=at_once).read_bytes() == CONTENT
+    assert download(serve(behaviour), tmp_path / "model.pt", policy=without_waits).read_bytes() == CONTENT
     assert starts in (None, behaviour.starts)
 
 
@@ -119,7 +116,7 @@ def test_download_resumes_the_partial_file_of_an_earlier_call(serve, tmp_path: P
     behaviour = Behaviour(cut_after=[1000, 0, 0])
     url = serve(behaviour)
     with pytest.raises(UnreachableError, match=r"2 attempts in .* failed.*1000 bytes are in .*model\.pt\.part"):
-        download(url, tmp_path / "model.pt", policy=twice)
+        download(url, tmp_path / "model.pt", policy=two_attempts)
     assert not (tmp_path / "model.pt").exists()
     assert download(url, tmp_path / "model.pt").read_bytes() == CONTENT
     assert behaviour.starts == [0, 1000, 1000, 1000]
@@ -128,10 +125,10 @@ def test_download_resumes_the_partial_file_of_an_earlier_call(serve, tmp_path: P
 def test_refusal_is_not_retried_and_a_missing_network_is_reported(serve, tmp_path: Path) -> None:
     behaviour = Behaviour(errors=[404])
     with pytest.raises(UnreachableError, match=r"cannot be read \(HTTP 404: .*Not Found"):
-        download(serve(behaviour), tmp_path / "model.pt", policy=at_once)
+        download(serve(behaviour), tmp_path / "model.pt", policy=without_waits)
     assert behaviour.starts == [0]
     with pytest.raises(UnreachableError, match=r"2 attempts in .* failed.*refused.* Check the network"):
-        download("http://127.0.0.1:9/model.pt", tmp_path / "model.pt", policy=twice)
+        download("http://127.0.0.1:9/model.pt", tmp_path / "model.pt", policy=two_attempts)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -145,9 +142,9 @@ def test_response_smaller_than_the_published_file_raises_and_keeps_the_partial_f
     part = tmp_path / PART
     part.write_bytes(CONTENT[:1000])
     url = serve(Behaviour(content=b"please wait", can_resume=False))
-    with pytest.raises(InputError, match=r"a file of 11 bytes\. Expected made-up, of 102,400 to 102,400 bytes.*proxy"):
+    with pytest.raises(InputError, match=r"a file of 11 bytes\. Expected 102,400 to 102,400 bytes for made-up.*proxy"):
         download(url, tmp_path / "made-up.pt", published=MADE_UP)
-    assert part.read_bytes() == CONTENT[:1000]  # the partial download is kept
+    assert part.read_bytes() == CONTENT[:1000]
     assert download(serve(Behaviour()), tmp_path / "made-up.pt", published=MADE_UP).read_bytes() == CONTENT
 
 
@@ -155,9 +152,9 @@ def test_existing_file_of_a_wrong_size_raises_with_its_path(serve, tmp_path: Pat
     behaviour = Behaviour()
     path, url = tmp_path / "made-up.pt", serve(behaviour)
     path.write_bytes(b"<html>")
-    with pytest.raises(InputError, match=r"made-up\.pt: a file of 6 bytes.*or name another with --to"):
+    with pytest.raises(InputError, match=r"made-up\.pt: a file of 6 bytes.*or set --to to another path"):
         download(url, path, published=MADE_UP)
-    with pytest.raises(InputError, match=r"a folder\. Expected the name of a file"):
+    with pytest.raises(InputError, match=r"a folder\. Expected the path of a file"):
         download(url, tmp_path, published=MADE_UP)
     assert behaviour.starts == []
 
@@ -179,10 +176,10 @@ def test_download_prints_the_kind_of_file_and_its_config_key(
     monkeypatch.setattr(model_files, "PUBLISHED", (MADE_UP,))
     monkeypatch.chdir(tmp_path)
     assert main(["download", "made-up", "--url", serve(Behaviour())]) == 0
-    shown = capsys.readouterr().out
-    assert "made-up: encoder" in shown
-    assert "102,400 bytes\nLicence of the test" in shown
-    assert shown.endswith("model.encoder.path: checkpoints/made-up.pt\n")
+    output = capsys.readouterr().out
+    assert "made-up: encoder" in output
+    assert "102,400 bytes\nLicence of the test" in output
+    assert output.endswith("model.encoder.path: checkpoints/made-up.pt\n")
     assert Path("checkpoints", MADE_UP.file).read_bytes() == CONTENT
 
 
