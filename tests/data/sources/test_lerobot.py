@@ -1,4 +1,4 @@
-"""LeRobot data sets v3.0 and v2.1: equal states and the right frames; conventions; errors of settings and files."""
+"""LeRobot data sets v3.0 and v2.1: states and frames, pose formats, and errors of settings and files."""
 
 import json
 import pickle
@@ -69,14 +69,14 @@ def v21(episodes: list[Recorded], tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 @pytest.fixture(params=["v30", "v21"])
-def either(request: pytest.FixtureRequest) -> Path:
+def data_set(request: pytest.FixtureRequest) -> Path:
     return request.getfixturevalue(request.param)
 
 
 @pytest.fixture
-def copy(either: Path, tmp_path: Path) -> Path:
+def copy(data_set: Path, tmp_path: Path) -> Path:
     """Return a copy of a data set of either version, which a test may change."""
-    return Path(shutil.copytree(either, tmp_path / "set"))
+    return Path(shutil.copytree(data_set, tmp_path / "set"))
 
 
 def first_rows(root: Path) -> Path:
@@ -90,8 +90,8 @@ def first_video(root: Path) -> Path:
 # --- reading -----------------------------------------------------------------------------------------------------
 
 
-def test_states_equal_the_written_states_in_every_version(either: Path, episodes: list[Recorded]) -> None:
-    source = source_of(either)
+def test_states_equal_the_written_states_in_every_version(data_set: Path, episodes: list[Recorded]) -> None:
+    source = source_of(data_set)
     assert isinstance(source, EpisodeSource)
     infos = source.infos()
     assert [info.num_steps for info in infos] == list(LENGTHS)
@@ -122,8 +122,8 @@ def test_frames_match_their_steps(
             assert [numbers_of(frame) for frame in frames] == expected
 
 
-def test_reads_are_independent_of_order_threads_and_process(either: Path) -> None:
-    def everything(source: LeRobotSource, order: list[int]) -> dict[int, tuple[bytes, bytes]]:
+def test_reads_are_independent_of_order_threads_and_process(data_set: Path) -> None:
+    def read_all(source: LeRobotSource, order: list[int]) -> dict[int, tuple[bytes, bytes]]:
         with ThreadPoolExecutor(4) as pool:
             read: list[Episode] = list(pool.map(source.read, order))
             frames = list(pool.map(lambda episode: episode.read_frames([3, 8]), read))
@@ -132,10 +132,10 @@ def test_reads_are_independent_of_order_threads_and_process(either: Path) -> Non
             for number, episode, pictures in zip(order, read, frames, strict=True)
         }
 
-    source = source_of(either)
+    source = source_of(data_set)
     source.infos()
-    forward = everything(source, [0, 1, 2, 3, 4, 0, 1, 2])
-    assert everything(pickle.loads(pickle.dumps(source)), [4, 2, 0, 3, 1]) == forward  # noqa: S301 - our own bytes
+    forward = read_all(source, [0, 1, 2, 3, 4, 0, 1, 2])
+    assert read_all(pickle.loads(pickle.dumps(source)), [4, 2, 0, 3, 1]) == forward  # noqa: S301 - our own bytes
 
 
 @pytest.mark.parametrize("pictures", ["png", "jpeg"])
@@ -151,12 +151,12 @@ def test_frames_are_read_from_image_columns(
 
 
 def count_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Return a list that gets the number of images of each read of a table."""
-    counts, images = list[int](), ParquetRows.read_images
+    """Return a list to which each read of images from a table appends the number of images."""
+    counts, read_images = list[int](), ParquetRows.read_images
 
-    def counted(self: ParquetRows, *place: Any) -> list[bytes]:
-        counts.append(len(found := images(self, *place)))
-        return found
+    def counted(self: ParquetRows, *arguments: Any) -> list[bytes]:
+        counts.append(len(read := read_images(self, *arguments)))
+        return read
 
     monkeypatch.setattr(ParquetRows, "read_images", counted)
     return counts
@@ -186,7 +186,7 @@ def write_data_set(folder: Path, state: np.ndarray, **columns: np.ndarray) -> Pa
     return write_v30(folder, [Recorded(named, frames)])
 
 
-OWN = {"state": ["observation.state"], "cameras": {"front": "observation.images.front"}}
+OWN_FIELDS = {"state": ["observation.state"], "cameras": {"front": "observation.images.front"}}
 
 
 @pytest.mark.parametrize("convention", ["quaternion_wxyz", "quaternion_xyzw"])
@@ -195,8 +195,8 @@ def test_all_rotation_formats_give_the_same_pose(convention: str, tmp_path: Path
     matrices = matrices_from_euler(states[:, 3:6])
     quaternions = Rotation.from_matrix(matrices).as_quat(scalar_first=convention == "quaternion_wxyz")
     quaternions[::2] *= -1  # q and -q are the same rotation
-    own = np.concatenate([states[:, :3], quaternions, states[:, 6:]], axis=1)
-    source = source_of(write_data_set(tmp_path / "set", own), lerobot=OWN | {"rotation": convention})
+    columns = np.concatenate([states[:, :3], quaternions, states[:, 6:]], axis=1)
+    source = source_of(write_data_set(tmp_path / "set", columns), lerobot=OWN_FIELDS | {"rotation": convention})
     read = source.read(0).states
     np.testing.assert_allclose(matrices_from_euler(read[:, 3:6]), matrices, atol=1e-9)
     np.testing.assert_allclose(read[:, 3:6], euler_from_matrices(matrices), atol=1e-9)
@@ -206,16 +206,16 @@ def test_all_rotation_formats_give_the_same_pose(convention: str, tmp_path: Path
 @pytest.mark.parametrize(("opened", "closed"), [(0.08, 0.0), (0.0, 0.08), (100.0, 0.0), (-1.0, 1.0), (1.0, 0.0)])
 def test_gripper_is_converted_to_closedness(opened: float, closed: float, tmp_path: Path) -> None:
     states = synthetic_states(15, seed=1)
-    own = states.copy()
-    own[:, 6] = opened + states[:, 6] * (closed - opened)
-    root = write_data_set(tmp_path / "set", own)
-    source = source_of(root, lerobot=OWN | {"gripper_open": opened, "gripper_closed": closed})
+    columns = states.copy()
+    columns[:, 6] = opened + states[:, 6] * (closed - opened)
+    root = write_data_set(tmp_path / "set", columns)
+    source = source_of(root, lerobot=OWN_FIELDS | {"gripper_open": opened, "gripper_closed": closed})
     np.testing.assert_allclose(source.read(0).states, states, atol=1e-12)
     if abs(closed - opened) > 1.1:
         with pytest.raises(
             InputError, match=r"Expected a gripper between 0 and 1: 0 for open, 1 for closed\. Check data\.lerobot"
         ):
-            source_of(root, lerobot=OWN).infos()
+            source_of(root, lerobot=OWN_FIELDS).infos()
 
 
 # --- invalid settings --------------------------------------------------------------------------------------------
@@ -240,9 +240,9 @@ def test_gripper_is_converted_to_closedness(opened: float, closed: float, tmp_pa
         ({"lerobot": {"cameras": {"left": "observation.images.left"}}}, r"no camera observation\.images\.left"),
     ],
 )
-def test_wrong_mapping_raises_a_config_error(changes: dict[str, Any], message: str, either: Path) -> None:
+def test_wrong_mapping_raises_a_config_error(changes: dict[str, Any], message: str, data_set: Path) -> None:
     with pytest.raises(InputError, match=message):
-        source_of(either, **changes).infos()
+        source_of(data_set, **changes).infos()
 
 
 @pytest.mark.parametrize(
@@ -272,19 +272,19 @@ def change_feature(root: Path, name: str, **changes: object) -> None:
 
 
 @pytest.mark.parametrize(
-    "mark",
+    "flag",
     [
         {"info": {"is_depth_map": True}},
         {"info": {"video.is_depth_map": True}},
         {"video_info": {"video.is_depth_map": True}},
         {"info": {"video.pix_fmt": "gray12le"}},
     ],
-    ids=["today", "before", "long before", "unmarked"],
+    ids=["current flag", "older flag", "oldest flag", "pixel format"],
 )
-def test_depth_map_is_not_a_camera(mark: dict[str, object], copy: Path) -> None:
+def test_depth_map_is_not_a_camera(flag: dict[str, object], copy: Path) -> None:
     change_feature(copy, KEY, info={"is_depth_map": False, "video.pix_fmt": "gray"})
     assert len(source_of(copy).infos()) == len(LENGTHS)
-    change_feature(copy, KEY, **({"info": {}} | mark))
+    change_feature(copy, KEY, **({"info": {}} | flag))
     with pytest.raises(InputError, match=rf"no camera {KEY} in .*Expected one of obs"):
         source_of(copy).infos()
     assert len(source_of(copy, camera="wrist_left").infos()) == len(LENGTHS)
@@ -314,13 +314,13 @@ def test_missing_data_set_raises_with_expected_layout(tmp_path: Path) -> None:
 # --- unusable episodes ------------------------------------------------------------------------------------------
 
 
-def spoiled(make: Callable[[list[list[float]]], Any]) -> Callable[[Path], None]:
-    """Return a function that replaces the states in the first file of a data set by `make(states)`."""
+def spoiled(change: Callable[[list[list[float]]], Any]) -> Callable[[Path], None]:
+    """Return a function that replaces the states in the first file of a data set by `change(states)`."""
 
     def spoil(root: Path) -> None:
         rows = pq.read_table(first_rows(root)).column(STATE[0]).to_pylist()
-        made = make(rows)
-        change_table(first_rows(root), **{STATE[0]: column_of(made) if isinstance(made, np.ndarray) else made})
+        states = change(rows)
+        change_table(first_rows(root), **{STATE[0]: column_of(states) if isinstance(states, np.ndarray) else states})
 
     return spoil
 
@@ -329,10 +329,10 @@ def with_value(step: int, value: float) -> Callable[[list[list[float]]], np.ndar
     return lambda rows: np.where((np.arange(len(rows)) == step)[:, None], np.float32(value), np.float32(rows))
 
 
-def select_rows(*places: int) -> Callable[[Path], None]:
+def select_rows(*indices: int) -> Callable[[Path], None]:
     def spoil(root: Path) -> None:
         table = pq.read_table(first_rows(root))
-        pq.write_table(table.take([*places, *range(12, len(table))]), first_rows(root))
+        pq.write_table(table.take([*indices, *range(12, len(table))]), first_rows(root))
 
     return spoil
 
@@ -348,8 +348,8 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "out of reach": (spoiled(with_value(5, 50.0)), "Expected a position within 5 m"),
     "five numbers": (spoiled(lambda rows: np.float32(rows)[:, :5]), r"5 numbers per row\. Expected 6, according to"),
     "uneven": (spoiled(lambda rows: pa.array([rows[0][:5], *rows[1:]], LIST)), "5 numbers in one row and 6 in another"),
-    "gaps": (spoiled(lambda rows: pa.array([None, *rows[1:]], LIST)), "1 row without a value"),
-    "words": (spoiled(lambda rows: pa.array(["a"] * len(rows))), "values of type string"),
+    "missing state": (spoiled(lambda rows: pa.array([None, *rows[1:]], LIST)), "1 row without a value"),
+    "text for numbers": (spoiled(lambda rows: pa.array(["a"] * len(rows))), "values of type string"),
     "lost rows": (select_rows(*range(10)), r"10 rows\. Expected 12"),
     "mixed rows": (select_rows(1, 0, *range(2, 12)), "frame_index does not count from 0 to 11"),
 }  # fmt: skip
@@ -381,12 +381,12 @@ TABLE = "meta/episodes/chunk-000/file-000.parquet"
 
 
 def change_ranges(root: Path, camera: str = KEY, **changes: dict[int, float]) -> None:
-    """Replace values in columns of a camera in the table of episodes, given by the numbers of the episodes."""
+    """Replace values in columns of a camera in the table of episodes: {episode number: value} for each column."""
     table = pq.read_table(root / TABLE)
     for column, values in changes.items():
         name = f"videos/{camera}/{column}"
         old = table.column(name).to_pylist()
-        change_table(root / TABLE, **{name: pa.array([values.get(n, one) for n, one in enumerate(old)])})
+        change_table(root / TABLE, **{name: pa.array([values.get(n, value) for n, value in enumerate(old)])})
 
 
 OVERLAPS: dict[str, tuple[dict[str, dict[int, float]], dict[str, str]]] = {
@@ -400,7 +400,7 @@ OVERLAPS: dict[str, tuple[dict[str, dict[int, float]], dict[str, str]]] = {
             "episode_000004": "episode_000003 and episode_000004 both contain 0 to 1 s of file-001.mp4",
         },
     ),
-    "one within another": (
+    "one episode within another": (
         {"to_timestamp": {0: 39 / FPS}},
         {
             "episode_000000": "episode_000000 and episode_000001 both contain 0.8 to 1.66667 s of file-000.mp4",
@@ -411,9 +411,9 @@ OVERLAPS: dict[str, tuple[dict[str, dict[int, float]], dict[str, str]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("how", OVERLAPS)
-def test_overlapping_time_ranges_in_a_video_are_problems(how: str, v30: Path, tmp_path: Path) -> None:
-    changes, expected = OVERLAPS[how]
+@pytest.mark.parametrize("overlap", OVERLAPS)
+def test_overlapping_time_ranges_in_a_video_are_problems(overlap: str, v30: Path, tmp_path: Path) -> None:
+    changes, expected = OVERLAPS[overlap]
     root = Path(shutil.copytree(v30, tmp_path / "set"))
     change_ranges(root, **changes)
     if len(expected) == len(LENGTHS):

@@ -1,4 +1,4 @@
-"""Missing libraries: not counted as broken episodes."""
+"""Missing libraries raise an error and mark no episode as broken."""
 
 import json
 import sys
@@ -35,9 +35,9 @@ def test_missing_reader_library_does_not_mark_episodes_as_broken(
 
 
 def test_missing_video_decoder_prevents_indexing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise the states of 100,000 episodes would be read before the first frame fails."""
-    folder, told = write_v21(tmp_path / "set", [recorded(0, 20)]), []
+    """Without the check, the states of 100,000 episodes would be read before the first frame fails."""
+    folder, progress_calls = write_v21(tmp_path / "set", [recorded(0, 20)]), []
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(UnreachableError, match=r"PyAV, which decodes and writes video, is not installed.*pip install"):
-        dataset_of(folder, lambda *done: told.append(done))
-    assert told == []
+        dataset_of(folder, lambda *done: progress_calls.append(done))
+    assert progress_calls == []

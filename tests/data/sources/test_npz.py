@@ -1,4 +1,4 @@
-""".npz episodes: any robot as plain arrays."""
+""".npz episodes: the arrays are read as written, and unusable files are problems."""
 
 import io
 import shutil
@@ -51,8 +51,8 @@ def test_episode_equals_the_written_arrays(tmp_path: Path, compressed: bool) -> 
 
 def test_extrinsics_per_camera_and_commands_are_read(tmp_path: Path) -> None:
     moving = np.arange(STEPS * 6.0).reshape(STEPS, 6)
-    more = {"extrinsics": np.arange(6.0), "extrinsics_wrist": moving, "joint_velocities": STATES}
-    write(tmp_path / "one.npz", wrist=WRIST, **more)
+    arrays = {"extrinsics": np.arange(6.0), "extrinsics_wrist": moving, "joint_velocities": STATES}
+    write(tmp_path / "one.npz", wrist=WRIST, **arrays)
     plain = source(tmp_path, pose_frame="camera")
     np.testing.assert_array_equal(plain.read(0).extrinsics, np.tile(np.arange(6.0), (STEPS, 1)))
     np.testing.assert_array_equal(plain.read(0, "wrist").extrinsics, moving)
@@ -62,16 +62,16 @@ def test_extrinsics_per_camera_and_commands_are_read(tmp_path: Path) -> None:
 def test_uncompressed_file_reads_only_requested_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "one.npz")
     episode = source(tmp_path).read(0)
-    read: list[int] = []
+    sizes: list[int] = []
 
     class CountedFile(io.FileIO):
         def readinto(self, buffer: Any) -> int:
-            read.append(count := super().readinto(buffer) or 0)
+            sizes.append(count := super().readinto(buffer) or 0)
             return count
 
     monkeypatch.setattr(storage, "open_for_reading", lambda path: io.BufferedReader(CountedFile(path)))
     episode.read_frames([5, 6])
-    assert sum(read) < FRAMES[:2].nbytes + 4 * io.DEFAULT_BUFFER_SIZE < FRAMES.nbytes / 2
+    assert sum(sizes) < FRAMES[:2].nbytes + 4 * io.DEFAULT_BUFFER_SIZE < FRAMES.nbytes / 2
 
 
 def test_file_changed_after_indexing_raises(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_file_changed_after_indexing_raises(tmp_path: Path) -> None:
         plain.read(0)
 
 
-def cut(path: Path) -> None:
+def truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-200])
 
 
@@ -97,7 +97,7 @@ NAN = np.where(np.arange(STEPS)[:, None] == 3, np.nan, STATES)
 
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "no states": (lambda path: write(path, without="states"), "states: no such array"),
-    "no rate worth the name": (lambda path: write(path, fps_hz=0.0), "fps_hz: 0"),
+    "rate of zero": (lambda path: write(path, fps_hz=0.0), "fps_hz: 0"),
     "another rate": (lambda path: write(path, fps_hz=30.0), "30 steps per second.*Expected 15 steps per second"),
     "no such camera": (lambda path: write(path, without="frames", wrist=WRIST), "frames: no such array"),
     "mistyped camera": (
@@ -107,7 +107,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "too few frames": (lambda path: write(path, frames=FRAMES[:-1]), r"frames: shape \(19, 36, 64, 3\)"),
     "float frames": (lambda path: write(path, frames=FRAMES / 255), "frames: shape .* float64"),
     "pickled frames": (lambda path: write(path, frames=np.array([{}, []], object)), "frames: .*objects"),
-    "turned frames": (
+    "frames in Fortran order": (
         lambda path: write(path, frames=np.asfortranarray(FRAMES)),
         r"frames: frames in Fortran order.*Expected C order.*ascontiguousarray",
     ),
@@ -115,8 +115,8 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "no steps": (lambda path: write(path, states=STATES[:0], frames=FRAMES[:0]), "no steps"),
     "not a number": (lambda path: write(path, states=NAN), "step 3"),
     "poses of another length": (lambda path: write(path, extrinsics=NAN[:4, :6]), r"extrinsics: shape \(4, 6\)"),
-    "numbers for words": (lambda path: write(path, language=3), "language: shape"),
-    "cut": (cut, "one.npz: cannot be read"),
+    "number for text": (lambda path: write(path, language=3), "language: shape"),
+    "truncated": (truncate, "one.npz: cannot be read"),
     "not an archive": (lambda path: path.write_text("<html>404</html>" * 99), "one.npz: cannot be read"),
     "a flipped bit in the states": (flip_in_states, "states: cannot be read .*CRC"),
 }
@@ -143,7 +143,7 @@ def test_unusable_episode_is_a_problem_with_its_name_and_reason(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("name", ["\udcff.npz", "\udcff/one.npz"])
-def test_array_name_that_is_not_utf8_raises(tmp_path: Path, name: str) -> None:
+def test_file_name_that_is_not_utf8_raises(tmp_path: Path, name: str) -> None:
     write(tmp_path / name)
     with pytest.raises(InputError, match=r"udcff.*UTF-8"):
         source(tmp_path).infos()

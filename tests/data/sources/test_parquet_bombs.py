@@ -1,4 +1,4 @@
-"""Parquet bombs: a small file with a huge content raises an error and is not decompressed beyond the limits."""
+"""Parquet bombs: a small file with huge content raises an error and is not decompressed beyond the limits."""
 
 import tracemalloc
 from pathlib import Path
@@ -47,7 +47,7 @@ def test_repeated_texts_are_rejected_before_conversion_to_python(
     [("contradicting_footer", "Definition level histogram"), ("mistyped_footer", "ColumnMetaData type does not match")],
 )
 def test_inconsistent_footer_raises_without_aborting_the_process(name: str, message: str, tmp_path: Path) -> None:
-    """Without the check, pyarrow 26 aborts the process if it reads this column's entry of the footer."""
+    """Without the check, pyarrow 26 would abort the process when it reads the footer's entry of this column."""
     columns = ("frame_index", "timestamp", "observation.state.cartesian_position", "action.joint_velocity")
     with pytest.raises(InputError, match=rf"{name}\.parquet: the file is damaged: {message}"):
         rows_of(tmp_path, *columns).read_rows(str(GOLDEN / f"{name}.parquet"), 0)

@@ -1,4 +1,4 @@
-"""RLDS episodes are read exactly, and errors name the record."""
+"""RLDS episodes equal the written episodes, and errors contain the path and number of the record."""
 
 import dataclasses
 import json
@@ -37,16 +37,16 @@ def open_droid(folder: Path, **values: Any) -> RldsSource:
     return RldsSource(DataConfig(path=str(folder), **values))
 
 
-def at_step_2(features: Features, name: str, value: float) -> None:
+def set_step_2(features: Features, name: str, value: float) -> None:
     values = features[f"steps/observation/{name}"][1]
     values[2 * len(values) // 12] = value
 
 
-def in_degrees(poses: list[float]) -> None:
-    poses[:] = [value * 57.3 if place % 6 >= 3 else value for place, value in enumerate(poses)]
+def convert_to_degrees(poses: list[float]) -> None:
+    poses[:] = [value * 57.3 if index % 6 >= 3 else value for index, value in enumerate(poses)]
 
 
-def error_of(problem: EpisodeProblem) -> InputError:
+def to_error(problem: EpisodeProblem) -> InputError:
     return InputError(where=problem.where, found=problem.found, needed=problem.needed, fix=problem.fix)
 
 
@@ -83,8 +83,8 @@ def test_states_and_images_equal_tfds_bit_for_bit(shared: Path) -> None:
     folder = shared / "data" / "droid_rlds"
     expected = json.loads((folder / "expected.json").read_text())
     with np.load(folder / "expected.npz") as arrays:
-        tfds = dict(arrays)
-    compared = 0
+        tfds_arrays = dict(arrays)
+    num_compared = 0
     for camera, feature in RldsFields().cameras.items():
         source = open_droid(folder / "r2d2_faceblur" / "1.0.0", camera=camera)
         assert [info.id for info in source.infos()] == expected["record_order"]
@@ -92,15 +92,15 @@ def test_states_and_images_equal_tfds_bit_for_bit(shared: Path) -> None:
             assert info.num_steps == expected["episodes"][info.id]["steps"]
             assert info.success == (expected["episodes"][info.id]["outcome"] == "success")
             episode = source.read(number)
-            assert np.array_equal(episode.states, tfds[f"{number}.states"])
-            for name, value in tfds.items():
+            assert np.array_equal(episode.states, tfds_arrays[f"{number}.states"])
+            for name, value in tfds_arrays.items():
                 if name.startswith(f"{number}.{feature.split('/')[-1]}."):
                     assert np.array_equal(episode.read_frames([int(name.split(".")[-1])])[0], value)
-                    compared += 1
-    assert compared == 18
+                    num_compared += 1
+    assert num_compared == 18
 
 
-def test_real_robot_episodes_with_mapped_feature_names(shared: Path) -> None:
+def test_real_robot_episodes_are_read_with_configured_feature_names(shared: Path) -> None:
     path = str(shared / "data" / "bridge_rlds" / "bridge_dataset" / "1.0.0")
     source = RldsSource(DataConfig(path=path, fields=BRIDGE, camera="image_0"))
     infos = source.infos()
@@ -129,16 +129,16 @@ def test_real_robot_episodes_with_mapped_feature_names(shared: Path) -> None:
         ),
         (lambda f: f.update({"steps/is_first": ("float_list", [1.0] * 12)}), "a float_list.*Expected a int64_list"),
         (lambda f: f.update({"steps/is_first": ("int64_list", [])}), "no steps.*Expected one or more"),
-        (lambda f: at_step_2(f, "cartesian_position", float("nan")), "step 2: .*finite"),
-        (lambda f: at_step_2(f, "gripper_position", 1.5), "step 2: .*gripper between 0 and 1"),
-        (lambda f: in_degrees(f["steps/observation/cartesian_position"][1]), "radians"),
+        (lambda f: set_step_2(f, "cartesian_position", float("nan")), "step 2: .*finite"),
+        (lambda f: set_step_2(f, "gripper_position", 1.5), "step 2: .*gripper between 0 and 1"),
+        (lambda f: convert_to_degrees(f["steps/observation/cartesian_position"][1]), "radians"),
         (
             lambda f: f["steps/observation/gripper_position"][1].extend([0.0] * 12),
             "position \\[6\\] .*position \\[2\\]",
         ),
     ],
 )
-def test_unusable_episode_is_a_problem_and_not_a_row(spoiled: Spoil, change: Any, message: str) -> None:
+def test_unusable_episode_is_a_problem_and_not_in_the_table(spoiled: Spoil, change: Any, message: str) -> None:
     def spoil(features: Features) -> None:
         change(features)
 
@@ -146,19 +146,21 @@ def test_unusable_episode_is_a_problem_and_not_a_row(spoiled: Spoil, change: Any
     assert len(table) == 5
     [problem] = table.problems
     assert "tfrecord-00000-of-00002: record 0 at byte 0" in problem.where
-    assert re.search(message, str(error_of(problem)))
+    assert re.search(message, str(to_error(problem)))
 
 
 def test_data_set_without_usable_episode_raises_first_error(tmp_path: Path, droid: Path) -> None:
-    drawn = [synthetic_episode(number, steps=40, size=(16, 32)) for number in range(3)]
+    good = [synthetic_episode(number, steps=40, size=(16, 32)) for number in range(3)]
     out_of_reach = {"observation/cartesian_position": np.full((40, 6), 7.0)}
-    bad = [dataclasses.replace(episode, arrays={**episode.arrays, **out_of_reach}) for episode in drawn]
-    folder = write_droid_rlds(tmp_path / "some", [drawn[0], *bad[1:]], shards=1)
+    out_of_reach_episodes = [
+        dataclasses.replace(episode, arrays={**episode.arrays, **out_of_reach}) for episode in good
+    ]
+    folder = write_droid_rlds(tmp_path / "some", [good[0], *out_of_reach_episodes[1:]], shards=1)
     table = open_droid(folder).infos()
     assert ([info.id for info in table], len(table.problems)) == ([table.identity(0)], 2)
-    every_one = write_droid_rlds(tmp_path / "every", bad, shards=1)
+    unusable_folder = write_droid_rlds(tmp_path / "every", out_of_reach_episodes, shards=1)
     with pytest.raises(InputError, match=r"within 5 m.*Check data\.fields: state, .*gripper_closed\.$"):
-        open_droid(every_one).infos()
+        open_droid(unusable_folder).infos()
     with pytest.raises(InputError, match="no feature steps/nothing"):
         open_droid(droid, fields=RldsFields(state=("steps/nothing",))).infos()
 
@@ -168,16 +170,16 @@ def test_first_read_on_a_machine_detects_damage(droid: Path, tmp_path: Path) -> 
     shard = sorted(folder.glob("*.tfrecord-*"))[0]
     open_droid(folder).read(0)
     change_silently(shard, index_records(shard)[0].end - 10, shard.stat())
-    open_droid(folder).read(0)  # as another process would do
+    open_droid(folder).read(0)  # a new source, as in another process
     with pytest.raises(InputError, match="record 0 at byte 0: the CRC of the data does not match"):
         open_droid(folder, disk_cache={"dir": str(tmp_path / "other")}).read(0)
 
 
-def change_silently(file: Path, place: int, status: os.stat_result) -> None:
+def change_silently(file: Path, offset: int, status: os.stat_result) -> None:
     """Flip a bit without changing size and modification time, as a failing disk does."""
-    whole = bytearray(file.read_bytes())
-    whole[place] ^= 1
-    file.write_bytes(whole)
+    content = bytearray(file.read_bytes())
+    content[offset] ^= 1
+    file.write_bytes(content)
     os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
 
 
@@ -198,15 +200,17 @@ def test_file_changed_during_use_raises(droid: Path, tmp_path: Path) -> None:
 def test_truncated_shard_loses_only_records_after_the_cut(droid: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(droid, tmp_path / "set")
     shard = sorted(folder.glob("*.tfrecord-*"))[0]
-    whole = shard.read_bytes()
+    content = shard.read_bytes()
     ends = [span.end for span in index_records(shard)]
-    for size in (0, 1, 12, 1000, len(whole) // 2, len(whole) - 1, *ends[:-1]):
-        shard.write_bytes(whole[:size])
+    for size in (0, 1, 12, 1000, len(content) // 2, len(content) - 1, *ends[:-1]):
+        shard.write_bytes(content[:size])
         table = open_droid(folder).infos()
-        found = sum(end <= size for end in ends)
-        assert (len(table), len(table.problems)) == (3 + found, 3 - found)
+        num_complete = sum(end <= size for end in ends)
+        assert (len(table), len(table.problems)) == (3 + num_complete, 3 - num_complete)
         assert all(shard.name in problem.where for problem in table.problems)
-        assert [problem.name for problem in table.problems] == [f"{shard.name}: record {n}" for n in range(found, 3)]
+        assert [problem.name for problem in table.problems] == [
+            f"{shard.name}: record {n}" for n in range(num_complete, 3)
+        ]
 
 
 def test_missing_shards_raise_with_their_names(droid: Path, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ URL = "gs://robots/droid/1.0.0"
 
 
 @pytest.fixture(scope="module")
-def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def long_episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four episodes of 80 steps in one shard, with the proportions of DROID: nearly all bytes are images."""
     return write_synthetic_droid(
         tmp_path_factory.mktemp("long") / "1.0.0", episodes=4, steps=80, size=(96, 160), shards=1
@@ -30,28 +30,28 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def open_remote(gcs: Gcs, tmp_path: Path) -> Callable[..., RldsSource]:
-    """Upload a folder once, and open it through the storage with a separate disk cache."""
+    """Return a function that uploads a folder once, and opens it behind a URL with a separate disk cache."""
     uploaded: set[Path] = set()
 
-    def put(folder: Path, **values: Any) -> RldsSource:
+    def open_uploaded(folder: Path, **values: Any) -> RldsSource:
         if folder not in uploaded:
             gcs.upload(folder, URL.removeprefix("gs://"))
             uploaded.add(folder)
         disk_cache = {"dir": str(tmp_path / "cache"), "limit_gb": values.pop("limit_gb", 1.0)}
         return RldsSource(DataConfig(path=URL, disk_cache=disk_cache, **values))
 
-    return put
+    return open_uploaded
 
 
-def same(one: Episode, other: Episode, steps: list[int]) -> bool:
-    assert one.joint_velocities is not None
-    assert other.joint_velocities is not None
+def are_equal(first: Episode, second: Episode, steps: list[int]) -> bool:
+    assert first.joint_velocities is not None
+    assert second.joint_velocities is not None
     return (
-        one.info == other.info
-        and one.metadata == other.metadata
-        and np.array_equal(one.states, other.states)
-        and np.array_equal(one.joint_velocities, other.joint_velocities)
-        and np.array_equal(one.read_frames(steps), other.read_frames(steps))
+        first.info == second.info
+        and first.metadata == second.metadata
+        and np.array_equal(first.states, second.states)
+        and np.array_equal(first.joint_velocities, second.joint_velocities)
+        and np.array_equal(first.read_frames(steps), second.read_frames(steps))
     )
 
 
@@ -66,13 +66,13 @@ def test_remote_reads_equal_local_reads(
     for number in range(6):
         for camera in RldsFields().cameras:
             for _ in range(2):  # first fetched, then read from the cache
-                assert same(remote.read(number, camera), local.read(number, camera), [11, 0, 3])
+                assert are_equal(remote.read(number, camera), local.read(number, camera), [11, 0, 3])
 
 
 def test_remote_indexing_reads_record_parts_once(
-    long: Path, open_remote: Callable[..., RldsSource], gcs: Gcs, tmp_path: Path
+    long_episodes: Path, open_remote: Callable[..., RldsSource], gcs: Gcs, tmp_path: Path
 ) -> None:
-    folder = in_any_order(long, tmp_path / "any", seed=1)
+    folder = in_any_order(long_episodes, tmp_path / "any", seed=1)
     source, progress_calls = open_remote(folder), list[tuple[int, int]]()
     assert list(source.infos(lambda *counts: progress_calls.append(counts))) == list(
         RldsSource(DataConfig(path=str(folder))).infos()
@@ -102,9 +102,9 @@ def entry_sizes(cache: Path) -> list[int]:
 
 
 def test_disk_cache_stays_within_its_limit_with_several_processes(
-    long: Path, open_remote: Callable[..., RldsSource], popen: Popen, tmp_path: Path
+    long_episodes: Path, open_remote: Callable[..., RldsSource], popen: Popen, tmp_path: Path
 ) -> None:
-    unlimited = open_remote(long)
+    unlimited = open_remote(long_episodes)
     for episode in range(4):
         for camera in RldsFields().cameras:
             unlimited.read(episode, camera).read_frames([0])
@@ -129,14 +129,14 @@ def test_intermittent_network_errors_do_not_change_results(
     def failing(action: Callable[[], Any]) -> Any:
         gcs.fail_next(failure, times=2, match=SHARD)
         result = action()
-        assert gcs.faults_left == 0, "both were met"
+        assert gcs.faults_left == 0, "both failures occurred"
         return result
 
     assert failing(lambda: list(open_remote(droid).infos())) == list(local.infos())
     source = open_remote(droid, limit_gb=0.0)
     for _ in range(2):  # first all images of the camera; then, with known positions, single images
         episode = failing(lambda: source.read(2))
-        assert failing(lambda episode=episode: same(episode, local.read(2), [0, 5]))
+        assert failing(lambda episode=episode: are_equal(episode, local.read(2), [0, 5]))
 
 
 def test_later_clip_without_cache_fetches_only_its_frames(
@@ -147,5 +147,5 @@ def test_later_clip_without_cache_fetches_only_its_frames(
     source.read(0).read_frames([0])
     gcs.forget()
     source.read(0).read_frames(range(0, 40, 5))
-    share = gcs.bytes_read("-of-00001") / next(folder.glob("*.tfrecord-*")).stat().st_size
-    assert share < 1.5 * 8 / (3 * 40)
+    fraction = gcs.bytes_read("-of-00001") / next(folder.glob("*.tfrecord-*")).stat().st_size
+    assert fraction < 1.5 * 8 / (3 * 40)

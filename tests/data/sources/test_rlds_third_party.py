@@ -27,10 +27,10 @@ FRAMES = [np.stack([draw_frame(state, size=SIZE) for state in states]) for state
 
 
 def write(folder: Path, *, images: Any = None, states: Any = None, kinds: Any = None, names: Any = None) -> Path:
-    """Write six episodes; each argument replaces the values of one kind of feature: a function of the episode."""
+    """Write six episodes; each argument but `kinds` is a function that returns features of an episode."""
     records = []
     for number in range(EPISODES):
-        record = {"steps/is_first": np.arange(STEPS) == 0, IMAGE: [encoded(one) for one in FRAMES[number]]}
+        record = {"steps/is_first": np.arange(STEPS) == 0, IMAGE: [encoded(frame) for frame in FRAMES[number]]}
         record |= {STATE: TRUE[number]} if states is None else states(TRUE[number])
         record |= {} if images is None else images(number)
         record |= {NAME: [f"/data/{number}".encode()]} if names is None else names(number)
@@ -41,34 +41,38 @@ def write(folder: Path, *, images: Any = None, states: Any = None, kinds: Any = 
     return write_rlds_set(folder, records, features)
 
 
-def proposed(folder: Path) -> tuple[DataConfig, dict[str, str]]:
+def propose_config(folder: Path) -> tuple[DataConfig, dict[str, str]]:
     """Return the data config that `init` proposes, and the guessed values."""
-    found = read_properties(str(folder))
+    properties = read_properties(str(folder))
     data = {
         "source": "rlds",
         "path": str(folder),
-        "states": found.states,
-        **plain_values(found.config_values),
+        "states": properties.states,
+        **plain_values(properties.config_values),
         "workers": 0,
     }
     values = {"run_dir": "none", "data": data, "model": {"base": "builtin:sim-tiny"}}
-    return parse_config(values, where="init").data, list_guesses(found.config_values)
+    return parse_config(values, where="init").data, list_guesses(properties.config_values)
 
 
-def require_true(config: DataConfig, *, tolerance: float = 1e-5) -> None:
+def assert_true_states(config: DataConfig, *, tolerance: float = 1e-5) -> None:
     source = open_source(config)
     assert len(source.infos()) == EPISODES
     for number in range(EPISODES):
         read = source.read(number).states
-        away = Rotation.from_euler("xyz", read[:, 3:6]) * Rotation.from_euler("xyz", TRUE[number][:, 3:6]).inv()
+        rotation_error = (
+            Rotation.from_euler("xyz", read[:, 3:6]) * Rotation.from_euler("xyz", TRUE[number][:, 3:6]).inv()
+        )
         assert np.abs(read[:, [0, 1, 2, 6]] - TRUE[number][:, [0, 1, 2, 6]]).max() < tolerance
-        assert away.magnitude().max() < 1e-3
+        assert rotation_error.magnitude().max() < 1e-3
 
 
 @pytest.mark.parametrize("mode", [None, "RGBA", "P", "L"])
 def test_image_format_is_detected_from_content(mode: str | None, tmp_path: Path) -> None:
-    folder = write(tmp_path / "set", images=lambda number: {IMAGE: [encoded(one, mode=mode) for one in FRAMES[number]]})
-    config, _ = proposed(folder)
+    folder = write(
+        tmp_path / "set", images=lambda number: {IMAGE: [encoded(frame, mode=mode) for frame in FRAMES[number]]}
+    )
+    config, _ = propose_config(folder)
     read = open_source(config).read(2).read_frames([5, 0])
     expected = FRAMES[2][[5, 0]]
     if mode == "L":
@@ -84,19 +88,19 @@ def test_image_format_is_detected_from_content(mode: str | None, tmp_path: Path)
     ids=["without metadata", "empty names", "equal names"],
 )
 def test_records_without_identity_feature_are_numbered(names: Any, tmp_path: Path) -> None:
-    config, guessed = proposed(write(tmp_path / "set", names=names))
+    config, guessed = propose_config(write(tmp_path / "set", names=names))
     assert config.fields.identity == "record"
     assert "written again" in guessed["fields.identity"] or "rewriting the data set" in guessed["fields.identity"]
-    require_true(config)
+    assert_true_states(config)
     assert len({info.id for info in open_source(config).infos()}) == EPISODES
     assert len(open_dataset(config.model_copy(update={"frames": 3, "stride": 1})).windows("train"))
 
 
-def in_format(states: Float[np.ndarray, "steps 7"], rotation: str) -> Float[np.ndarray, "steps _"]:
-    turned = Rotation.from_euler("xyz", states[:, 3:6])
+def convert_states(states: Float[np.ndarray, "steps 7"], rotation: str) -> Float[np.ndarray, "steps _"]:
+    rotations = Rotation.from_euler("xyz", states[:, 3:6])
     numbers = {
-        "quaternion_xyzw": turned.as_quat(),
-        "rotation_vector": turned.as_rotvec(),
+        "quaternion_xyzw": rotations.as_quat(),
+        "rotation_vector": rotations.as_rotvec(),
         "euler_xyz_degrees": np.rad2deg(states[:, 3:6]),
     }
     return np.concatenate([states[:, :3], numbers[rotation], states[:, 6:]], axis=1)
@@ -113,9 +117,9 @@ def in_format(states: Float[np.ndarray, "steps 7"], rotation: str) -> Float[np.n
         (lambda s: {STATE: np.c_[s[:, :6], 2 * s[:, 6] - 1]}, None, {"gripper_open": -1.0, "gripper_closed": 1.0}),
         (lambda s: {STATE: np.c_[s[:, :6], 0.08 * (1 - s[:, 6])]}, None, {"gripper_closed": 0.0}),
         (lambda s: {STATE: np.c_[1000 * s[:, :3], s[:, 3:]]}, None, {"position_unit": "mm"}),
-        (lambda s: {STATE: in_format(s, "euler_xyz_degrees")}, None, {"rotation": "euler_xyz_degrees"}),
+        (lambda s: {STATE: convert_states(s, "euler_xyz_degrees")}, None, {"rotation": "euler_xyz_degrees"}),
         (
-            lambda s: {STATE: in_format(s, "quaternion_xyzw")},
+            lambda s: {STATE: convert_states(s, "quaternion_xyzw")},
             {STATE: ("float32", (8,))},
             {"rotation": "quaternion_xyzw"},
         ),
@@ -130,14 +134,16 @@ def in_format(states: Float[np.ndarray, "steps 7"], rotation: str) -> Float[np.n
 def test_state_formats_are_proposed_and_read(
     states: Any, kinds: Any, expected: Mapping[str, Any], tmp_path: Path
 ) -> None:
-    config, guessed = proposed(write(tmp_path / "set", states=states, kinds=kinds))
+    config, guessed = propose_config(write(tmp_path / "set", states=states, kinds=kinds))
     for key, value in expected.items():
         assert getattr(config.fields, key) == value, guessed
     if "bool" in str(kinds):
         closed = open_source(config).read(0).states[:, 6]
         assert np.array_equal(closed, TRUE[0][:, 6] > 0.5)
-    elif "gripper_closed" in expected or "select" in expected:  # the width of the open gripper is the recorded one
+    elif (
+        "gripper_closed" in expected or "select" in expected
+    ):  # the width of the open gripper is only known from the recordings
         closed, true = open_source(config).read(0).states[:, 6], TRUE[0][:, 6]
         assert np.corrcoef(closed, true)[0, 1] > 0.999
     else:
-        require_true(config, tolerance=1e-3)
+        assert_true_states(config, tolerance=1e-3)

@@ -1,4 +1,4 @@
-"""Writing RLDS: DROID's schema as TFDS writes it (golden/DATA_ORIGIN.md), complete or not at all."""
+"""Written RLDS data sets have DROID's schema, as written by TFDS (golden/DATA_ORIGIN.md)."""
 
 import json
 from pathlib import Path

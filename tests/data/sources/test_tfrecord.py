@@ -1,4 +1,4 @@
-"""TFRecords are read back as written, and every damage is detected and described."""
+"""TFRecords: written records are read back unchanged, and bytes of other formats raise an error."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -48,13 +48,13 @@ features = st.dictionaries(
 @given(features=features)
 def test_features_are_located_without_reading_other_features(features: dict) -> None:
     data = b"before" + encode_example(features) + b"after"
-    located = dict(iterate_features(reader_of(data), 6, len(data) - 11))
-    assert located.keys() == features.keys()
+    feature_ranges = dict(iterate_features(reader_of(data), 6, len(data) - 11))
+    assert feature_ranges.keys() == features.keys()
     for name, (kind, values) in features.items():
-        offset, length = located[name]
-        found_kind, found = decode_feature(data[offset : offset + length])
-        assert list(found) == values
-        assert found_kind == kind
+        offset, length = feature_ranges[name]
+        decoded_kind, decoded_values = decode_feature(data[offset : offset + length])
+        assert list(decoded_values) == values
+        assert decoded_kind == kind
     decoded = decode_example(data[6:-5])
     assert {name: list(values) for name, (_, values) in decoded.items()} == {n: v for n, (_, v) in features.items()}
 
