@@ -226,7 +226,7 @@ TRAINING_HOOKS = Registry(
         "data.stride": "inspection.variants:choose_stride",
         "validation.decoder": "decoding.imagine:ValidationStrip",
         "motion": "inspection.motion:warnings_from_index",
-        "coverage": "inspection.coverage:coverage_in",
+        "coverage": "inspection.coverage:measure_coverage",
     },
 )
 """Functions and classes outside of the core packages that training calls."""

@@ -14,7 +14,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index import StepSelection
 from vjepa2_ac.inspection.check import check_data
-from vjepa2_ac.inspection.excerpts import excerpt_findings, excerpts_of
+from vjepa2_ac.inspection.excerpts import excerpt_findings, read_excerpts
 from vjepa2_ac.inspection.findings import Finding
 from vjepa2_ac.spaces import POSE, StateSpace, make_vector_states
 
@@ -141,7 +141,7 @@ def test_excerpt_is_the_middle_of_the_longest_selected_range() -> None:
     dataset = in_memory([300] * 4 + [20], exclude=())
     ranges = StepSelection(*(np.array(column, np.int32) for column in ([4, 4], [0, 8], [5, 20])))
     dataset = Dataset(dataset.config, dataset.source, dataset.table, ranges, dataset.broken)
-    (found,) = excerpts_of(dataset, steps=6)
+    (found,) = read_excerpts(dataset, steps=6)
     assert found.name == "episode 4"
     np.testing.assert_array_equal(found.states, dataset.source.read(4).states[11:17])
     source = dataset.source

@@ -14,12 +14,12 @@ from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.inspection import motion
-from vjepa2_ac.inspection.coverage import sample_of
+from vjepa2_ac.inspection.coverage import select_sample
 from vjepa2_ac.inspection.findings import Finding
 from vjepa2_ac.inspection.motion import (
     Stretch,
     check_motion,
-    speed_finding,
+    check_speed,
     warnings_from_index,
 )
 
@@ -145,7 +145,7 @@ def test_speed_example_is_the_step_between_joined_recordings(tmp_path: Path) -> 
     assert f"step {STEPS - 1} to {STEPS}: " in warnings["speed"]
     states = joined(0)[0]
     stretch = Stretch("e", 7, np.concatenate([states[:40], states[40:]]))
-    text = speed_finding([stretch], RATE_HZ, "1 of 1 episode checked").text
+    text = check_speed([stretch], RATE_HZ, "1 of 1 episode checked").text
     jump_m = np.linalg.norm(states[40, :3] - states[39, :3])
     assert f"Example: e, step 46 to 47: {RATE_HZ * jump_m:.1f} m/s" in text
 
@@ -162,7 +162,7 @@ def test_single_impossible_position_in_one_episode_is_reported(
 ) -> None:
     monkeypatch.setattr(motion, "_EPISODES", in_sample)
     config = config_of(tmp_path / "set", with_one_outlier)
-    assert (open_dataset(config).table.find("004") in sample_of(open_dataset(config), in_sample)) == (in_sample > 1)
+    assert (open_dataset(config).table.find("004") in select_sample(open_dataset(config), in_sample)) == (in_sample > 1)
     for text in (read_warnings(config)["speed"], *(one.text for one in warnings_from_index(open_dataset(config)))):
         assert ": 2 control steps in 1 episode (" in text
         assert "Example: 004, step " in text

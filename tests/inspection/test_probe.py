@@ -20,9 +20,9 @@ from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.inspection.probe import (
     UNCHANGED,
     VariantProbe,
-    mirrored,
+    make_variants,
+    mirror_poses,
     probe_variants,
-    variants_of,
 )
 from vjepa2_ac.inspection.variants import VariantResult
 from vjepa2_ac.intervals import Estimate
@@ -126,8 +126,8 @@ FAULTS: dict[str, Fault] = {
     **{f"frames {n} step{'s' * (n > 1)} late": at(n) for n in (1, 8)},
     **{f"frames {n} step{'s' * (n > 1)} early": at(-n) for n in (2, 4)},
     "states reversed": lambda states: at(0)(states)[::-1].copy(),
-    "x negated": lambda states: mirrored(at(0)(states), 0),
-    "y negated": lambda states: mirrored(at(0)(states), 1),
+    "x negated": lambda states: mirror_poses(at(0)(states), 0),
+    "y negated": lambda states: mirror_poses(at(0)(states), 1),
     "gripper inverted": lambda states: with_inverted_gripper(at(0)(states)),
 }
 
@@ -211,7 +211,7 @@ def test_shifts_are_limited_by_the_states_on_both_sides_of_a_clip(steps: int, wi
 
 def test_variants_depend_on_the_state_and_on_available_frames() -> None:
     def names(**changes: object) -> set[str]:
-        return {one.name for one in variants_of(DataConfig.model_validate({"path": "set"} | changes), [1])}
+        return {one.name for one in make_variants(DataConfig.model_validate({"path": "set"} | changes), [1])}
 
     shifted = {"frames 1 step late", "frames 1 step early"}
     colours = {"red and blue exchanged", "frames mirrored"}
@@ -243,12 +243,12 @@ def test_persistence_is_measured_on_the_changed_frames() -> None:
 def test_mirroring_twice_restores_poses_and_rotations_stay_proper(axis: int) -> None:
     generator = np.random.default_rng(axis)
     states = generator.uniform(-1, 1, (50, 7)) * [1, 1, 1, np.pi, 1.5, np.pi, 1]
-    seen = mirrored(states, axis)
+    seen = mirror_poses(states, axis)
     np.testing.assert_allclose(np.linalg.det(matrices_from_euler(seen[:, 3:6])), 1)
-    np.testing.assert_allclose(mirrored(seen, axis), states, atol=1e-9)
+    np.testing.assert_allclose(mirror_poses(seen, axis), states, atol=1e-9)
     np.testing.assert_allclose(seen[:, axis], -states[:, axis])
     np.testing.assert_allclose(np.delete(seen, [axis, 3, 4, 5], axis=1), np.delete(states, [axis, 3, 4, 5], axis=1))
     actions, of_seen = actions_from_states(states), actions_from_states(seen)
-    np.testing.assert_allclose(mirrored(actions, axis), of_seen, atol=1e-9)  # so do its actions
+    np.testing.assert_allclose(mirror_poses(actions, axis), of_seen, atol=1e-9)  # so do its actions
     pointing, of_mirror = (matrices_from_euler(one[:, 3:6])[:, :, 2] for one in (states, seen))
     np.testing.assert_allclose(of_mirror, pointing * np.where(np.arange(3) == axis, -1, 1), atol=1e-9)

@@ -10,7 +10,7 @@ from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.inspection.statistics import MOVED, TURNED, idle_runs, inspect_dataset
+from vjepa2_ac.inspection.statistics import MOVED, TURNED, find_idle_steps, inspect_dataset
 
 
 def make_data_config(droid: Path, **changes: object) -> DataConfig:
@@ -44,7 +44,7 @@ def test_only_long_enough_idle_runs_count_as_idle() -> None:
     states = straight_on(30)
     states[5:10] = states[5]  # steps 6 to 9 are idle: too short a run
     states[15:25] = states[15]
-    assert np.flatnonzero(idle_runs(states, DataConfig(path="x"))).tolist() == list(range(16, 25))
+    assert np.flatnonzero(find_idle_steps(states, DataConfig(path="x"))).tolist() == list(range(16, 25))
 
 
 def test_statistics_of_a_data_set_equal_values_computed_by_hand(droid: Path) -> None:

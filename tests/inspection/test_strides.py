@@ -124,7 +124,7 @@ def test_stride_longer_than_every_episode_is_reported_and_the_others_are_measure
 def test_stride_that_fits_one_episode_only_is_impossible() -> None:
     found = calibrated(ConstantVelocity(4), tracks([30] * 6 + [80] * 1))
     assert list(found.results) == [4, 8]
-    assert "1 episode only" in found.impossible[15]
+    assert "only 1 episode" in found.impossible[15]
     assert found.best.episodes >= 5
 
 
@@ -152,6 +152,6 @@ def test_best_variant_needs_twice_the_half_width_of_its_interval() -> None:
     """Both were chosen on these clips: an interval that just leaves 0 out says little."""
     result = VariantResult("one", Estimate(0.5, 0.4, 0.6), 0.2, 0.4, clips=10, episodes=10)
     narrow, wide = (replace(result, difference=Estimate(-0.1, -0.1 - half, half - 0.1)) for half in (0.03, 0.08))
-    assert narrow.is_certainly_better(needed=10)
-    assert not wide.is_certainly_better(needed=10)
-    assert not narrow.is_certainly_better(needed=11)
+    assert narrow.is_certainly_better(min_episodes=10)
+    assert not wide.is_certainly_better(min_episodes=10)
+    assert not narrow.is_certainly_better(min_episodes=11)

@@ -16,7 +16,7 @@ from tiny_models import actions, goal, scene, tiny_model
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.inspection.axes import TRIED_DEGREES, fit_axes
+from vjepa2_ac.inspection.axes import ANGLES_DEGREES, fit_axes
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import AxesRotation, WorldModelCost
@@ -134,7 +134,7 @@ def test_run_accepts_axes_calibrated_for_its_trained_weights(make_config: Any, t
 
 
 def test_calibration_output_can_be_read(tmp_path: Path) -> None:
-    errors = 1.1 - np.cos(np.deg2rad(np.array(TRIED_DEGREES) - 90.0))
+    errors = 1.1 - np.cos(np.deg2rad(np.array(ANGLES_DEGREES) - 90.0))
     fit = fit_axes(np.tile(errors, (40, 1)), [f"{index // 4}" for index in range(40)])
     assert fit.problem is None
     model = tiny_model()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.inspection.excerpts import Excerpt, small_grey
+from vjepa2_ac.inspection.excerpts import Excerpt, convert_to_small_grey
 
 STEPS, RATE_HZ = 48, 15.0
 ROWS, COLUMNS = 24, 32
@@ -41,7 +41,7 @@ def spot_excerpt(
     name: int | str, states: Float[np.ndarray, "steps 7"], frames: UInt8[np.ndarray, "steps rows columns 3"]
 ) -> Excerpt:
     """Return these as the check looks at them."""
-    return Excerpt(str(name), states, small_grey(frames))
+    return Excerpt(str(name), states, convert_to_small_grey(frames))
 
 
 def write_spots(folder: Path, episodes: list[tuple[np.ndarray, np.ndarray]]) -> Path:

@@ -118,9 +118,9 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
     from vjepa2_ac.cli.tables import print_finding, variants_table
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.inspection.check import check_data
-    from vjepa2_ac.inspection.findings import Finding, findings_as_dict, summary_of
+    from vjepa2_ac.inspection.findings import Finding, findings_as_dict, summarize_findings
     from vjepa2_ac.inspection.probe import probe_config
-    from vjepa2_ac.inspection.statistics import at_some_stride
+    from vjepa2_ac.inspection.statistics import with_numeric_stride
 
     findings: list[Finding] = []
 
@@ -135,7 +135,7 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
         for finding in check_data(config.data, seed=config.seed, batch_size=batch_size, clips=clips, progress=progress):
             add(finding)
         if model is not None:
-            dataset, progress = at_some_stride(open_dataset(config.data)), reporter.task("probing")
+            dataset, progress = with_numeric_stride(open_dataset(config.data)), reporter.task("probing")
             probe = probe_config(config, dataset, model=model, clips=2 * clips, progress=progress)
     variants = [] if probe is None else [probe.plain, *probe.results]
     if variants and not as_json:
@@ -146,7 +146,7 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
         values = to_plain([asdict(variant) for variant in variants])
         print(format_json({**findings_as_dict(findings), "variants": values}), end="")
     else:
-        cli.show(summary_of(findings))
+        cli.show(summarize_findings(findings))
     return int(any(finding.level == "error" for finding in findings))
 
 
@@ -156,10 +156,10 @@ def _inspect(options: argparse.Namespace) -> None:
     cli.make_folder(options.out)
 
     from vjepa2_ac.inspection.sheet import plot_dataset
-    from vjepa2_ac.inspection.statistics import at_some_stride, inspect_dataset
+    from vjepa2_ac.inspection.statistics import inspect_dataset, with_numeric_stride
 
     with cli.reporter() as reporter:
-        dataset = at_some_stride(cli.open_data(config, reporter))
+        dataset = with_numeric_stride(cli.open_data(config, reporter))
         if config.data.stride == "auto":
             reporter.note(f"data.stride is auto: inspected at the smallest candidate, {dataset.config.stride}")
         inspection = inspect_dataset(dataset, episodes=options.episodes, progress=reporter.task("reading states"))
@@ -191,7 +191,7 @@ def _calibrate(options: argparse.Namespace) -> int:
         sample = ClipSample(options.split, options.limit or _CLIPS)
         calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
     path = cli.write_json(options.out / "calibration.json", calibration.as_dict())
-    title = f"One-step error relative to persistence, {options.split} episodes, {calibration.frames} frames per clip"
+    title = f"One-step error relative to persistence, {options.split} clips of {calibration.frames} frames"
     table = variants_table(title, list(calibration.results.values()), calibration.best)
     reasons = [f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()]
     cli.show(table, *reasons, calibration.verdict(), files=[path])

@@ -157,13 +157,20 @@ def print_finding(finding: Finding) -> None:
 
 def variants_table(title: str, results: Sequence[VariantResult], best: VariantResult | None = None) -> Table:
     """Return the table of `data check --model` and `data calibrate`, with one row per variant of the same clips."""
-    columns = ["variant", "error / persistence", "difference", "error", "persistence", "episodes"]
-    table = MetricsTable(f"{title} (95 % interval over episodes)", columns)
+    columns = ["variant", "error ratio", "95 % CI", "difference", "95 % CI", "episodes"]
+    table = MetricsTable(f"{title} (95 % CI over episodes)", columns)
     for result in results:
-        difference = "" if result.difference is None else str(result.difference)
-        numbers = (f"{result.error:.4f}", f"{result.persistence:.4f}", f"{result.episodes}")
-        table.add_row(f"{result.name}{' <' * (result is best)}", str(result.ratio), difference, *numbers)
+        cells = [*_estimate_cells(result.ratio), *_estimate_cells(result.difference)]
+        table.add_row(f"{result.name}{' <' * (result is best)}", *cells, str(result.episodes))
     return table
+
+
+def _estimate_cells(estimate: Estimate | None) -> tuple[str, str]:
+    """Return the cells of a value and of its interval; empty if they do not exist."""
+    if estimate is None:
+        return "", ""
+    interval = f"{estimate.low:.3f} to {estimate.high:.3f}" if estimate.has_interval else ""
+    return f"{estimate.value:.3f}", interval
 
 
 def scores_table(scores: PolicyScores) -> Table:

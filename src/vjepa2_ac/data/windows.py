@@ -104,14 +104,13 @@ def select_split_windows(
     length = f"{counted(config.clip_steps, 'step')} for a clip of {config.frames} frames at stride {config.stride}"
     short = np.flatnonzero(members & (table.num_steps < config.clip_steps)).astype(np.int32)
     short = short[np.argsort(table.id_rank[short])]
-    names = tuple(table.identity(index) for index in short[: MAX_NAMED + 1].tolist())
     if len(short) == count:
         longest = int(short[np.argmax(table.num_steps[short])])
         problem = f"all {count} {split} episodes are shorter than a clip; the longest,"
-        problem += f" {table.identity(longest)}, has {counted(table.num_steps[longest], 'step')}."
-        problem += f" Too short: {format_identities(names, len(short))}"
+        problem += f" {table.identity(longest)}, has {counted(table.num_steps[longest], 'step')}"
         raise InputError(where=where, found=problem, needed=length, fix="Lower data.frames or data.stride")
     if len(short):
+        names = tuple(table.identity(index) for index in short[: MAX_NAMED + 1].tolist())
         text = f"{config.path}: {len(short)} of {count} {split} episodes are shorter than a clip of {config.clip_steps}"
         _warn_once(f"{text} control steps and are skipped: {format_identities(names, len(short))}")
     windows = starts.select(members[starts.episode])

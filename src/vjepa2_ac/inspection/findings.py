@@ -1,4 +1,4 @@
-"""Findings (the lines of `data check`) with their summary, and duplicated episodes, which are found from the index."""
+"""Findings, which are the lines of `data check`, and the search for duplicated episodes in the index."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ Level = Literal["ok", "warning", "error", "skipped"]
 DUPLICATES_FIX = "List copies in data.exclude, or keep related episodes in one split with data.split_by"
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 
-_NEAR = 1e-4  # tolerance of means and spans of copies; rounding to 0.1 mm changes them less
-_MOVING = 1e-2  # episodes with smaller spans are not compared: they may agree because the robot does not move
-_MOST_COPIES = 8  # copies of one recording; if there are more, some may be missed
+_NEAR = 1e-4  # maximum difference between the means and spans of copies; rounding to 0.1 mm changes them less
+_MOVING = 1e-2  # episodes with smaller spans are not compared: they may be equal because the robot does not move
+_MAX_COPIES = 8  # number of copies of one recording that are certainly found
 
 
 @dataclass(frozen=True)
 class Finding:
     """The result of one check of a data set.
 
-    With an error training would fail or learn nothing. A warning means that something is probably wrong. A skipped
-    check did not run or could not decide; the text states what it needs.
+    An error means that training would fail or learn nothing. A warning means that something is probably wrong. A
+    skipped check did not run or could not decide; the text states what the check needs.
     """
 
     level: Level
@@ -39,14 +39,14 @@ class Finding:
 
 
 def first_case(about: str, text: str, *cases: tuple[bool, Level, str]) -> Finding:
-    """Return the finding of the first case whose condition is true, or else the level `ok`.
+    """Return the finding of the first case whose condition is true; without such a case the level is ok.
 
     Args:
         about: Name of the check.
         text: The measured values.
         cases: Condition, level and explanation of each case.
     """
-    level, explanation = next(((level, explanation) for holds, level, explanation in cases if holds), ("ok", ""))
+    level, explanation = next(((level, explanation) for is_true, level, explanation in cases if is_true), ("ok", ""))
     return Finding(level, about, f"{text}: {explanation}" if explanation else text)
 
 
@@ -61,7 +61,7 @@ def findings_as_dict(findings: Sequence[Finding]) -> dict[str, Any]:
     }
 
 
-def summary_of(findings: Sequence[Finding]) -> str:
+def summarize_findings(findings: Sequence[Finding]) -> str:
     """Return the last line of `data check`, such as "0 errors, 1 warning, 3 skipped"."""
     counts = Counter(finding.level for finding in findings)
     return f"{counted(counts['error'], 'error')}, {counted(counts['warning'], 'warning')}, {counts['skipped']} skipped"
@@ -73,14 +73,14 @@ class Duplicates:
 
     is_known: bool  # whether the states were compared
     episodes: int = 0  # number of episodes with a copy
-    different: int = 0  # number of different recordings among them
-    across: int = 0  # number of them with a copy in another split
+    different: int = 0  # number of different recordings among these episodes
+    across: int = 0  # number of episodes with a copy in another split
     example: tuple[tuple[str, Split], ...] = ()  # two copies with their splits, if possible in different splits
     copies: tuple[str, ...] = ()  # identities of all but the first episode of each recording
 
     @property
     def level(self) -> Level:
-        """The status of the check: a warning if there are copies."""
+        """The level of the finding: a warning if there are copies."""
         return "skipped" if not self.is_known else "warning" if self.episodes else "ok"
 
     def __str__(self) -> str:
@@ -96,18 +96,18 @@ class Duplicates:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return this as plain values, for `inspect.json`."""
+        """Return the plain values for `inspect.json`."""
         return vars(self) | {"example": [name for name, _ in self.example]}
 
 
 def find_duplicates(dataset: Dataset) -> Duplicates:
-    """Find duplicates among all used episodes, from hashes and summaries of their states in the index."""
+    """Find duplicates among the used episodes by the hashes, means and spans of their states in the index."""
     table = dataset.table
     if table.state_hash is None:
         return Duplicates(is_known=False)
     members = np.flatnonzero(dataset.is_selected & (table.state_hash != UNKNOWN))
     members = members[np.argsort(table.id_rank[members])]
-    recordings = _recordings(table, members, table.state_hash[members])
+    recordings = _number_recordings(table, members, table.state_hash[members])
     is_copied = np.bincount(recordings)[recordings] > 1
     members, recordings = members[is_copied], recordings[is_copied]
     if not len(members):
@@ -129,16 +129,16 @@ def find_duplicates(dataset: Dataset) -> Duplicates:
     )
 
 
-def _recordings(
+def _number_recordings(
     table: EpisodeTable, members: Int[np.ndarray, " members"], hashes: UInt64[np.ndarray, " members"]
 ) -> Int[np.ndarray, " members"]:
-    """Return a number for each episode, which is the same for episodes with equal or nearly equal states."""
+    """Return the number of the recording of each episode, equal for episodes with equal or nearly equal states."""
     motion = table.motion[members]
     numbers = np.unique(hashes, return_inverse=True)[1]
-    moving = np.flatnonzero(motion[:, SPANS].max(axis=1, initial=0.0) > _MOVING)  # without unknown motion
+    moving = np.flatnonzero(motion[:, SPANS].max(axis=1, initial=0.0) > _MOVING)  # excludes unknown motion
     points = np.column_stack([motion[moving, 2:], table.num_steps[members[moving]]])
-    _, nearest = KDTree(points).query(points, k=_MOST_COPIES, p=np.inf, distance_upper_bound=_NEAR)
-    # The appended number is that of a missing neighbour.
+    _, nearest = KDTree(points).query(points, k=_MAX_COPIES, p=np.inf, distance_upper_bound=_NEAR)
+    # KDTree returns the index len(points) for a missing neighbour, to which the appended number belongs.
     numbers[moving] = np.append(numbers[moving], len(members))[nearest].min(axis=1)
     return np.asarray(numbers)
 

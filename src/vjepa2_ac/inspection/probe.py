@@ -1,7 +1,7 @@
-"""Find out whether a trained model predicts better on mirrored, shifted or otherwise changed data.
+"""Compare the error of a trained model on a data set with its errors on mirrored, shifted or otherwise changed data.
 
-The same clips are measured unchanged and with one change at a time, which applies to all episodes; no file is changed.
-If a variant is certainly better, the data are most likely recorded or configured wrongly in this respect.
+The same clips are measured unchanged and with one change at a time, which applies to all episodes. No file is changed.
+If the error is certainly lower with a change, the data are most likely recorded or configured wrongly in this respect.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from vjepa2_ac.inspection.variants import (
     SameClips,
     Variant,
     VariantResult,
+    compute_result,
     load_named,
     measure_variants,
-    result_of,
 )
 from vjepa2_ac.intervals import MIN_EPISODES
 from vjepa2_ac.spaces import POSE, euler_from_matrices, matrices_from_euler
 
 SHIFTS = (1, 2, 4, 8)  # control steps
 UNCHANGED = "unchanged"
-_CANDIDATES_PER_CLIP = 8  # candidate starts per clip, because shifts need further states on both sides
+_CANDIDATES_PER_CLIP = 8  # candidate starts per clip, because many have too few states on both sides for a shift
 _GAIN = 0.01  # smaller gains, relative to persistence, are irrelevant
 
 
@@ -52,8 +52,8 @@ class VariantProbe:
 
     @property
     def better(self) -> VariantResult | None:
-        """The best variant, if it is certainly better than the unchanged data and better than persistence."""
-        certain = [result for result in self.results if result.is_certainly_better(needed=MIN_EPISODES)]
+        """The best variant that is certainly better than the unchanged data and better than persistence; None: none."""
+        certain = [result for result in self.results if result.is_certainly_better(min_episodes=MIN_EPISODES)]
         gains = {result: -result.difference.value for result in certain if result.difference and result.ratio.high < 1}
         better = [result for result, gain in gains.items() if gain > _GAIN]
         return max(better, key=lambda result: gains[result], default=None)
@@ -64,7 +64,7 @@ class VariantProbe:
         return self.better is not None or (self.plain.episodes >= MIN_EPISODES and self.plain.ratio.value < 1)
 
     def verdict(self) -> str:
-        """Return a sentence that states whether the unchanged data fit the model best."""
+        """Return as text whether the model predicts the unchanged data best."""
         plain, better = self.plain, self.better
         text = f"one-step error relative to persistence {plain.ratio} on {counted(plain.clips, 'clip')}"
         text += f" from {counted(plain.episodes, 'episode')}"
@@ -81,14 +81,14 @@ class VariantProbe:
 def probe_config(
     config: Config, dataset: Dataset, *, model: str, clips: int = 64, progress: Progress = no_progress
 ) -> VariantProbe:
-    """Compare variants of a data set, opened at a fixed stride, with a model.
+    """Compare a data set with changed variants by the error of a model.
 
     Args:
         config: The config, for device and precision.
-        dataset: The data set.
+        dataset: The data set, at a fixed stride.
         model: A model in a form that `model.base` accepts, or the folder of a run.
-        clips: Number of clips, from validation episodes, or from training episodes if there is no validation split.
-        progress: Called with the number of measured clips.
+        clips: Maximum number of clips, from the validation split, or from the training split if there is none.
+        progress: Called with the number of measured clips and the total number.
 
     Raises:
         InputError: The data or the model cannot be used.
@@ -109,102 +109,107 @@ def probe_config(
 def probe_variants(
     model: Predictor, encode: Encode, dataset: Dataset, sample: ClipSample, progress: Progress = no_progress
 ) -> VariantProbe:
-    """Measure a model's one-step error on unchanged clips, and under each variant.
+    """Measure a model's one-step error on unchanged clips and on each variant.
 
     Args:
         model: The predictor.
         encode: Encodes the frames.
         dataset: The data set, at a fixed stride.
         sample: The clips.
-        progress: Called with (clips done, clips in total).
+        progress: Called with the number of measured clips and the total number.
 
     Raises:
         InputError: The split is empty, or a clip cannot be read.
     """
-    # Starts of clips of the config's length, because a latent cache contains only these.
+    # The candidates are starts of clips with `data.frames` frames, because a latent cache contains only these.
     candidates = validation_windows(dataset, sample.split, clips=sample.clips * _CANDIDATES_PER_CLIP)
     frames = sample.num_frames(dataset.config)
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": frames}))
-    windows, shifts = _with_room(dataset, candidates, sample.clips)
-    variants = [Variant(UNCHANGED, lambda same: same), *variants_of(dataset.config, shifts)]
+    windows, shifts = _select_shiftable(dataset, candidates, sample.clips)
+    variants = [Variant(UNCHANGED, lambda unchanged: unchanged), *make_variants(dataset.config, shifts)]
     clips = SameClips(dataset, windows, sample.batch_size)
-    plain, *measured = measure_variants(model, encode, clips, variants, progress)
+    plain, *changed = measure_variants(model, encode, clips, variants, progress)
     results = [
-        result_of(errors, variant.name, reference=plain, repair=variant.repair)
-        for variant, errors in zip(variants[1:], measured, strict=True)
+        compute_result(errors, variant.name, reference=plain, repair=variant.repair)
+        for variant, errors in zip(variants[1:], changed, strict=True)
     ]
-    return VariantProbe(result_of(plain, UNCHANGED), tuple(results))
+    return VariantProbe(compute_result(plain, UNCHANGED), tuple(results))
 
 
-def _with_room(
+def _select_shiftable(
     dataset: Dataset, candidates: list[tuple[int, int]], clips: int
 ) -> tuple[list[tuple[int, int]], list[int]]:
-    """Return the starts of clips, and the shifts for which each clip has enough states before and after it."""
-    steps, length = dataset.table.num_steps, dataset.config.clip_steps
-    enough = max(1, min(clips, len(candidates) // 4))
+    """Return the windows of clips, and the shifts for which each clip has enough states before and after it."""
+    num_steps, length = dataset.table.num_steps, dataset.config.clip_steps
+    min_clips = max(1, min(clips, len(candidates) // 4))
     fitting, shifts = candidates, list[int]()
     for shift in SHIFTS:
-        wider = [(episode, start) for episode, start in fitting if shift <= start <= steps[episode] - length - shift]
-        if len(wider) < enough:
+        remaining = [
+            (episode, start) for episode, start in fitting if shift <= start <= num_steps[episode] - length - shift
+        ]
+        if len(remaining) < min_clips:
             break
-        fitting = wider
+        fitting = remaining
         shifts.append(shift)
     return [fitting[index] for index in spread_indices(len(fitting), clips)], shifts
 
 
-def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
-    """Return the variants that apply to this data.
+def make_variants(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
+    """Return the variants that apply to a data set.
 
     Args:
         config: The data config.
         shifts: Control steps by which to shift frames relative to states.
     """
     variants = [
-        _variant(
-            f"frames {_steps(shift)} {'late' if shift > 0 else 'early'}",
-            f"give each frame the state of {_steps(shift)} {'before' if shift > 0 else 'after'}",
-            partial(shifted, late=shift),
+        _make_variant(
+            f"frames {_format_steps(shift)} {'late' if shift > 0 else 'early'}",
+            f"give each frame the state of {_format_steps(shift)} {'before' if shift > 0 else 'after'}",
+            partial(shift_states, late=shift),
         )
         for size in shifts
         for shift in (size, -size)
     ]
     if config.actions == "difference":  # recorded commands cannot be reversed
-        backwards = _of_states(lambda states: np.ascontiguousarray(states[::-1]))
-        variants.append(_variant("states reversed", "reverse the order of the frames", backwards))
+        backwards = _change_states(lambda states: np.ascontiguousarray(states[::-1]))
+        variants.append(_make_variant("states reversed", "reverse the order of the frames", backwards))
     if config.states == "pose":
         for axis, name in enumerate("xy"):
             repair = f"negate {name} and mirror the rotation"
-            variants.append(_variant(f"{name} negated", repair, _of_states(partial(mirrored, axis=axis))))
-        inverted = _of_states(lambda states: np.append(states[:, :-1], 1 - states[:, -1:], axis=1))
+            variants.append(_make_variant(f"{name} negated", repair, _change_states(partial(mirror_poses, axis=axis))))
+        inverted = _change_states(lambda states: np.append(states[:, :-1], 1 - states[:, -1:], axis=1))
         section, fields = config.pose_fields
         repair = f"exchange data.{section}.gripper_open and gripper_closed" if fields else "write 1 - gripper"
-        variants.append(_variant("gripper inverted", repair, inverted))
+        variants.append(_make_variant("gripper inverted", repair, inverted))
     if not config.is_cache:
-        exchanged, flipped = _of_frames(lambda frames: frames[..., ::-1]), _of_frames(lambda frames: frames[:, :, ::-1])
+        exchanged, flipped = (
+            _change_frames(lambda frames: frames[..., ::-1]),
+            _change_frames(lambda frames: frames[:, :, ::-1]),
+        )
         repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
-        variants.append(_variant("red and blue exchanged", repair, exchanged, has_frames=True))
+        variants.append(_make_variant("red and blue exchanged", repair, exchanged, has_frames=True))
         repair = "flip the frames, left to right, where the data is written"
-        variants.append(_variant("frames mirrored", repair, flipped, has_frames=True))
+        variants.append(_make_variant("frames mirrored", repair, flipped, has_frames=True))
     return variants
 
 
-def _variant(name: str, repair: str, change: Callable[[Episode], Episode], *, has_frames: bool = False) -> Variant:
-    """Return a variant that changes each episode; without `has_frames` its frames are not read."""
+def _make_variant(name: str, repair: str, change: Callable[[Episode], Episode], *, has_frames: bool = False) -> Variant:
+    """Return a variant that changes each episode. Without `has_frames` the frames are not read."""
 
     def no_frames(steps: Sequence[int]) -> np.ndarray:
         return np.zeros((len(steps), 1, 1, 3), np.uint8)
 
-    def changed(episode: Episode) -> Episode:
-        result = change(episode)
-        return result if has_frames else replace(result, read_frames=no_frames, read_latents=None)
+    def change_episode(episode: Episode) -> Episode:
+        changed = change(episode)
+        return changed if has_frames else replace(changed, read_frames=no_frames, read_latents=None)
 
     def view(dataset: Dataset) -> Dataset:
-        return replace(dataset, source=ReadOnce(dataset.source, changed))
+        return replace(dataset, source=ReadOnce(dataset.source, change_episode))
 
     return Variant(name, view, has_frames, repair)
 
 
-def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarray, "steps 7"]:
+def mirror_poses(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarray, "steps 7"]:
     """Mirror poses by negating one coordinate and the rotations about the two other axes."""
     mirror = np.ones(3)
     mirror[axis] = -1
@@ -212,23 +217,23 @@ def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarra
     return np.concatenate([states[:, POSE.position] * mirror, euler_from_matrices(rotations), states[:, -1:]], axis=1)
 
 
-def _steps(shift: int) -> str:
+def _format_steps(shift: int) -> str:
     return counted(abs(shift), "step")
 
 
-def shifted(episode: Episode, *, late: int) -> Episode:
-    """Give each step the state and the command of `late` steps earlier, repeating the first or last one at the ends."""
+def shift_states(episode: Episode, *, late: int) -> Episode:
+    """Give each step the state and the command of `late` steps before; at the ends, the first or last step repeats."""
     steps = np.clip(np.arange(len(episode.states)) - late, 0, len(episode.states) - 1)
     commands = None if episode.commands is None else episode.commands[steps]
     return replace(episode, states=episode.states[steps], commands=commands)
 
 
-def _of_states(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:
+def _change_states(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:
     return lambda episode: replace(episode, states=change(episode.states))
 
 
-def _of_frames(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:
-    def changed(episode: Episode) -> Episode:
+def _change_frames(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:
+    def change_episode(episode: Episode) -> Episode:
         return replace(episode, read_frames=lambda steps: np.ascontiguousarray(change(episode.read_frames(steps))))
 
-    return changed
+    return change_episode

@@ -16,7 +16,7 @@ from vjepa2_ac.data.idle import find_idle_by_motion, find_long_idle
 from vjepa2_ac.data.windows import candidate_strides
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, counted
-from vjepa2_ac.inspection.coverage import Coverage, ReadEpisode, coverage_by, coverage_findings, read_sample
+from vjepa2_ac.inspection.coverage import Coverage, ReadEpisode, coverage_findings, coverage_of_episodes, read_sample
 from vjepa2_ac.inspection.findings import SPLITS, Duplicates, Finding, find_duplicates
 from vjepa2_ac.spaces import rotation_angles
 
@@ -28,7 +28,7 @@ RELEASED_STEP_CM = 12.9  # motion of the flange between the two frames of upstre
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """The statistics of a data set; motion is measured on a sample of the used episodes."""
+    """The statistics of a data set. Motion is measured on a sample of the used episodes."""
 
     dataset: Dataset
     duplicates: Duplicates
@@ -36,7 +36,7 @@ class Inspection:
 
     @property
     def has_poses(self) -> bool:
-        """Whether the states contain a position, from which motion is measured."""
+        """Whether the states contain a position."""
         return self.dataset.spaces.state.position is not None
 
     @cached_property
@@ -47,20 +47,20 @@ class Inspection:
 
     @cached_property
     def coverage(self) -> Coverage | None:
-        """Action coverage of the sample at the config's stride; None if no episode is as long as a model step."""
-        return coverage_by(self.sample, self.dataset.spaces.state, self.dataset.config.model_stride)
+        """Action coverage of the sample at the config's stride; None if no episode is longer than a step."""
+        return coverage_of_episodes(self.sample, self.dataset.spaces.state, self.dataset.config.model_stride)
 
     @cached_property
     def steps(self) -> dict[int, dict[str, Float[np.ndarray, " pairs"]]]:
-        """Size of the motion in a model step for each candidate stride: MOVED and TURNED for poses, else CHANGED."""
-        return {stride: self._at_stride(stride) for stride in candidate_strides(self.dataset.control_rate_hz)}
+        """Motion per model step for each candidate stride: MOVED and TURNED for poses, CHANGED for vectors."""
+        return {stride: self._measure_steps(stride) for stride in candidate_strides(self.dataset.control_rate_hz)}
 
-    def _at_stride(self, stride: int) -> dict[str, Float[np.ndarray, " pairs"]]:
+    def _measure_steps(self, stride: int) -> dict[str, Float[np.ndarray, " pairs"]]:
         space = self.dataset.spaces.state
         pieces = [piece for episode in self.sample for piece in episode.changes(stride, space)]
         changes = np.concatenate([np.zeros((0, len(space))), *pieces])
         if not self.has_poses:
-            return {CHANGED: largest_change(changes, self.ranges)}
+            return {CHANGED: compute_largest_changes(changes, self.ranges)}
         turned_deg = np.rad2deg(rotation_angles(changes[:, space.rotation]))
         return {MOVED: space.compute_display_size(changes), TURNED: turned_deg}
 
@@ -68,7 +68,7 @@ class Inspection:
     def values(self) -> dict[str, Any]:
         """All statistics as plain values, as in `inspect.json`."""
         config, table, rate = self.dataset.config, self.dataset.table, self.dataset.control_rate_hz
-        known, lengths = table.success[table.success >= 0], np.percentile(table.num_steps, [0, 10, 50, 90, 100])
+        outcomes, lengths = table.success[table.success >= 0], np.percentile(table.num_steps, [0, 10, 50, 90, 100])
         values: dict[str, Any] = {
             "path": config.path,
             "source": config.source,
@@ -79,9 +79,9 @@ class Inspection:
             "steps": int(table.num_steps.sum()),
             "hours": float(table.num_steps.sum() / rate / 3600),
             "length_percentiles_0_10_50_90_100": lengths.astype(int).tolist(),
-            "success_share": float(known.mean()) if len(known) else None,
-            "success_known_of": len(known),
-            "splits": {split: self._size_of(split) for split in SPLITS},
+            "success_share": float(outcomes.mean()) if len(outcomes) else None,
+            "success_known_of": len(outcomes),
+            "splits": {split: self._count(split) for split in SPLITS},
             "duplicates": self.duplicates.as_dict(),
             "sampled_episodes": len(self.sample),
             "ranges": self.ranges.tolist(),
@@ -98,11 +98,11 @@ class Inspection:
         }
         if self.has_poses:
             values["still_share"] = float(
-                np.concatenate([idle_runs(episode.states, config) for episode in self.sample]).mean()
+                np.concatenate([find_idle_steps(episode.states, config) for episode in self.sample]).mean()
             )
         return values
 
-    def _size_of(self, split: Split) -> dict[str, int]:
+    def _count(self, split: Split) -> dict[str, int]:
         try:
             windows = len(self.dataset.windows(split))
         except InputError:  # an empty split is a statistic here, not an error
@@ -126,14 +126,14 @@ class Inspection:
         num_known = counted(values["success_known_of"], "episode")
         ranges = [f"{low:.2f} to {high:.2f}" for low, high in self.ranges]
         if self.has_poses:
-            about_states = {
+            state_lines = {
                 "idle": f"{100 * values['still_share']:.1f} % of the steps, by the measured motion",
                 "position": f"{', '.join(f'{axis} {limits}' for axis, limits in zip('xyz', ranges, strict=False))} m",
                 "gripper": f"{ranges[-1]} (0 open, 1 closed)",
             }
         else:
             widths, joined = self.dataset.widths, f", joined by {config.join_actions}" if config.join_actions else ""
-            about_states = {
+            state_lines = {
                 "states": f"{widths.state} numbers: {', '.join(ranges)}",
                 "actions": f"{widths.action} numbers, {config.actions}{joined}",
             }
@@ -150,17 +150,17 @@ class Inspection:
             "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
             "duplicates": f"{duplicates}{copies}",
             "sample": f"{counted(len(self.sample), 'episode')}; the following lines are measured on this sample",
-            **about_states,
+            **state_lines,
             **{finding.about: _with_status(finding) for finding in coverage_findings(self.coverage)},
         }
 
 
 def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress = no_progress) -> Inspection:
-    """Compute the statistics of a data set: from the table for all episodes, from the states of a sample for motion.
+    """Compute the statistics of a data set from its table, and from the states of a sample of episodes.
 
     Args:
         dataset: A data set whose stride is a number.
-        episodes: Number of episodes that are read, without frames.
+        episodes: Maximum number of episodes to read, without frames.
         progress: Called with (episodes read, total number).
 
     Raises:
@@ -170,7 +170,7 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
 
 
 def _with_status(finding: Finding) -> str:
-    """Return the text of a finding, with its status in front unless it is ok."""
+    """Return the text of a finding. If the level is not ok, the text starts with it."""
     return finding.text if finding.level == "ok" else f"{finding.level}: {finding.text}"
 
 
@@ -179,21 +179,21 @@ def _percentiles(values: Float[np.ndarray, " pairs"]) -> list[float]:
     return np.percentile(values, list(PERCENTILES)).tolist() if len(values) else []
 
 
-def idle_runs(states: Float[np.ndarray, "steps 7"], config: DataConfig) -> Bool[np.ndarray, " steps"]:
-    """Return which steps are in idle ranges, by measured motion, that are long enough for the idle filter."""
+def find_idle_steps(states: Float[np.ndarray, "steps 7"], config: DataConfig) -> Bool[np.ndarray, " steps"]:
+    """Return a mask of the steps that do not move for long enough to be removed by the idle filter."""
     return find_long_idle(find_idle_by_motion(states, config.idle), config.idle)
 
 
-def largest_change(
+def compute_largest_changes(
     changes: Float[np.ndarray, "steps state_dim"], ranges: Float[np.ndarray, "state_dim 2"]
 ) -> Float[np.ndarray, " steps"]:
-    """Return the largest change of a number at each step, in percent of the number's range."""
+    """Return the largest change of any number at each step, in percent of the range of the number."""
     spans = ranges[:, 1] - ranges[:, 0]
     return np.asarray((abs(changes) / np.where(spans > 0, spans, np.inf)).max(axis=1) * 100)
 
 
-def at_some_stride(dataset: Dataset) -> Dataset:
-    """Return the data set with a fixed stride: its own, or the smallest candidate if it is auto."""
+def with_numeric_stride(dataset: Dataset) -> Dataset:
+    """Return the data set itself, or with the smallest candidate stride if `data.stride` is auto."""
     if dataset.config.stride != "auto":
         return dataset
     return dataset.with_stride(min(candidate_strides(dataset.control_rate_hz)))

@@ -1,9 +1,9 @@
-"""Compare variants of reading the same clips of a data set, by the prediction error of a model.
+"""Compare variants of a data set, such as other strides, by the prediction error of a model on the same clips.
 
-A model's one-step error relative to persistence is lowest if frames, states and actions are as in its training. This is
-used to calibrate the stride: the step length of the released weights is unknown (see IMPLEMENTATION_NOTES), and robots
-differ in their control rate. At each candidate stride, clips start at the same control steps of the same held-out
-episodes. Other variants are in `inspection.probe`.
+A model's one-step error relative to persistence is lowest if frames, states and actions are as in its training. The
+stride is calibrated by this error, because the step length of the released weights is unknown (see
+IMPLEMENTATION_NOTES), and robots differ in their control rate. At each candidate stride, clips start at the same
+control steps of the same held-out episodes. `inspection.probe` defines other variants.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ from vjepa2_ac.storage.structured import to_plain
 Encode = Callable[[Batch], LatentBatch]  # encodes pixels into latents, on the model's device
 
 _MARGIN = 2.0  # required half-widths of the 95 % interval, because the best of several variants is selected
-_EPISODES_NEEDED = 2  # for an interval
-_EPISODES_TO_BE_SURE = 10  # an interval from fewer is too narrow
+_MIN_EPISODES_FOR_INTERVAL = 2
+_MIN_EPISODES_TO_BE_CERTAIN = 10  # intervals from fewer episodes are too narrow
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One variant of reading a data set."""
+    """A changed data set with the same clips."""
 
     name: str
-    view: Callable[[Dataset], Dataset]
-    has_frames: bool = True  # False: the frames equal those of the first variant, so its latents are used
-    repair: str = ""  # the fix if this variant is better
+    view: Callable[[Dataset], Dataset]  # returns the changed data set
+    has_frames: bool = True  # False: the frames are those of the first variant, whose latents are then used
+    repair: str = ""  # how to correct the data if the model predicts this variant better
 
 
 @dataclass(frozen=True)
@@ -61,43 +61,43 @@ class VariantResult:
     name: str
     ratio: Estimate  # error relative to persistence
     error: float  # mean over clips
-    persistence: float
+    persistence: float  # error of persistence, mean over clips
     clips: int
     episodes: int
-    difference: Estimate | None = None  # ratio minus that of another variant on the same clips; below 0: better
+    difference: Estimate | None = None  # ratio minus the ratio of another variant on the same clips; below 0: better
     repair: str = ""
 
-    def is_certainly_better(self, *, needed: int) -> bool:
+    def is_certainly_better(self, *, min_episodes: int) -> bool:
         """Return whether the difference is below 0 by more than twice the half-width of its interval.
 
         The margin is larger than usual, because the variant was selected on the same clips.
 
         Args:
-            needed: Minimum number of episodes; with fewer, intervals are too narrow.
+            min_episodes: Minimum number of episodes, because intervals from few episodes are too narrow.
         """
-        if self.difference is None or not self.difference.has_interval or self.episodes < needed:
+        if self.difference is None or not self.difference.has_interval or self.episodes < min_episodes:
             return False
         return self.difference.value + _MARGIN * (self.difference.high - self.difference.value) < 0
 
 
-# The one-step, teacher-forced L1 errors of the model and of persistence, by clip (episode, first control step).
+# Clip (episode, first control step) -> one-step, teacher-forced L1 errors of the model and of persistence.
 VariantErrors = dict[tuple[str, int], Float[np.ndarray, " 2"]]
 
 
-def result_of(
+def compute_result(
     errors: VariantErrors, name: str, *, reference: VariantErrors | None = None, repair: str = ""
 ) -> VariantResult:
-    """Return the result of a variant from its errors, compared with the reference on their common clips."""
+    """Compute the result of a variant from its errors; the difference is that from `reference` on common clips."""
     ids, difference = [episode for episode, _ in errors], None
     if reference is not None:
         common = [clip for clip in errors if clip in reference]
-        variant, other = (np.array([part[clip] for clip in common]).T.copy() for part in (errors, reference))
+        variant, other = (np.array([each[clip] for clip in common]).T.copy() for each in (errors, reference))
         difference = estimate_ratio_difference(
             (variant[0], variant[1]), (other[0], other[1]), [name for name, _ in common]
         )
-    of_model, of_persistence = np.array(list(errors.values())).T.copy()
-    means, counts = (float(of_model.mean()), float(of_persistence.mean())), (len(ids), len(set(ids)))
-    return VariantResult(name, estimate_ratio(of_model, of_persistence, ids), *means, *counts, difference, repair)
+    model, persistence = np.array(list(errors.values())).T.copy()
+    means, counts = (float(model.mean()), float(persistence.mean())), (len(ids), len(set(ids)))
+    return VariantResult(name, estimate_ratio(model, persistence, ids), *means, *counts, difference, repair)
 
 
 @dataclass(frozen=True)
@@ -105,44 +105,44 @@ class SameClips:
     """The clips on which variants are compared."""
 
     dataset: Dataset
-    windows: Sequence[tuple[int, int]]  # episode and first control step of each
+    windows: Sequence[tuple[int, int]]  # episode and first control step of each clip
     batch_size: int  # clips per batch
 
 
 def measure_variants(
     model: Predictor, encode: Encode, clips: SameClips, variants: Sequence[Variant], progress: Progress = no_progress
 ) -> list[VariantErrors]:
-    """Measure a model's one-step error on the same clips under each variant; each episode is read only once.
+    """Measure a model's one-step error on the same clips of each variant. Each episode is read only once.
 
     Args:
         model: The predictor.
         encode: Encodes the frames.
         clips: The clips.
         variants: The variants. The first one determines which clips can be read.
-        progress: Called with (clips done, clips in total), over all variants.
+        progress: Called with the number of measured clips and the total number, over all variants.
 
     Raises:
         InputError: A clip cannot be read, or no clip can be read although `data.broken_episodes` skips broken ones.
     """
-    first, done, dataset, windows = variants[0], 0, clips.dataset, clips.windows
-    parts: list[VariantErrors] = [{} for _ in variants]
+    first, num_measured, dataset, windows = variants[0], 0, clips.dataset, clips.windows
+    errors_by_variant: list[VariantErrors] = [{} for _ in variants]
     for batch in read_batches(first.view(dataset), windows, batch_size=clips.batch_size):
-        latents, read = encode(batch), replace(dataset, source=ReadOnce(dataset.source))
+        latents, with_memory = encode(batch), replace(dataset, source=ReadOnce(dataset.source))
         indices = [dataset.table.find(name) for name in batch.episode_ids]
         starts = [(index, start) for index, start in zip(indices, batch.starts, strict=True) if index is not None]
-        for variant, errors in zip(variants, parts, strict=True):
-            batches = [latents] if variant is first else _read(variant, read, starts, encode, latents)
+        for variant, errors in zip(variants, errors_by_variant, strict=True):
+            batches = [latents] if variant is first else _read_variant(variant, with_memory, starts, encode, latents)
             for latent_batch in batches:
-                errors |= _measured(model, latent_batch)
-            done += len(batch.starts)
-            progress(done, len(windows) * len(variants))
-    return parts
+                errors |= _measure_errors(model, latent_batch)
+            num_measured += len(batch.starts)
+            progress(num_measured, len(windows) * len(variants))
+    return errors_by_variant
 
 
-def _read(
+def _read_variant(
     variant: Variant, dataset: Dataset, windows: Sequence[tuple[int, int]], encode: Encode, latents: LatentBatch
 ) -> Iterable[LatentBatch]:
-    """Yield a batch of clips under a variant; frames are encoded only if the variant changes them."""
+    """Yield the batch of a variant's clips. Frames are encoded only if the variant changes them."""
     for batch in read_batches(variant.view(dataset), windows, batch_size=len(windows)):
         if variant.has_frames:
             yield encode(batch)
@@ -151,7 +151,7 @@ def _read(
             yield replace(latents, states=batch.states.to(device), actions=batch.actions.to(device))
 
 
-def _measured(model: Predictor, latents: LatentBatch) -> VariantErrors:
+def _measure_errors(model: Predictor, latents: LatentBatch) -> VariantErrors:
     result = measure_errors(model, latents, ONE_STEP_PREDICTIONS, (L1,))
     errors = np.stack([result.of("teacher_forced", L1, kind).mean(axis=1) for kind, _ in ONE_STEP_PREDICTIONS], axis=1)
     return dict(zip(zip(latents.episode_ids, latents.starts, strict=True), errors, strict=True))
@@ -159,7 +159,7 @@ def _measured(model: Predictor, latents: LatentBatch) -> VariantErrors:
 
 @dataclass(frozen=True)
 class ReadOnce:
-    """A source that changes episodes, and keeps them in memory, because reading remote or large episodes is slow.
+    """A source that reads each episode once, changes it, and keeps it in memory, because reading may be slow.
 
     Args:
         source: The source.
@@ -176,7 +176,7 @@ class ReadOnce:
         return self.source.infos(progress)
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
-        """Return a changed episode; read it at the first call only."""
+        """Return a changed episode, which is read at the first call only."""
         if (index, camera) not in self.episodes:
             self.episodes[index, camera] = self.change(self.source.read(index, camera, needed))
         return self.episodes[index, camera]
@@ -194,7 +194,7 @@ def load_named(config: Config, dataset: Dataset, model: str | None) -> WorldMode
         InputError: There is no such model, it cannot be read, it is random, or it does not fit the data.
     """
     if model is None and config.model.is_random:
-        needed = "a trained model, because its error determines the stride"
+        needed = "a trained model, because the stride is selected by its error"
         fix = "Set data.stride to a number, or set model.base to a trained model (data calibrate: --model)"
         raise InputError(where="model.base: random", found="a random model", needed=needed, fix=fix)
     if model is None:
@@ -210,16 +210,16 @@ def load_named(config: Config, dataset: Dataset, model: str | None) -> WorldMode
 class Calibration:
     """The results at each stride, and the best stride."""
 
-    results: Mapping[int, VariantResult]  # by stride; the best one is compared with the second best
-    impossible: Mapping[int, str]  # by stride: the reason for which it could not be measured
-    frames: int
+    results: Mapping[int, VariantResult]  # by stride; the best stride is compared with the second best
+    impossible: Mapping[int, str]  # stride -> why it cannot be measured
+    frames: int  # number of frames of a clip
     split: Split
     rate_hz: float  # control steps per second
 
     @property
     def stride(self) -> int:
         """The stride with the lowest error relative to persistence."""
-        return _by_ratio(self.results)[0]
+        return _sort_by_ratio(self.results)[0]
 
     @property
     def best(self) -> VariantResult:
@@ -229,10 +229,10 @@ class Calibration:
     @property
     def is_certain(self) -> bool:
         """Whether the best stride is certainly better than the second best."""
-        return self.best.is_certainly_better(needed=_EPISODES_TO_BE_SURE)
+        return self.best.is_certainly_better(min_episodes=_MIN_EPISODES_TO_BE_CERTAIN)
 
     def verdict(self) -> str:
-        """Return a sentence with the best stride and its certainty."""
+        """Return the sentences with the best stride, and whether it is certain."""
         best, difference = self.best, self.best.difference
         seconds = self.stride / self.rate_hz
         text = (
@@ -241,14 +241,11 @@ class Calibration:
         if difference is None:
             text += "; no other stride was measured"
         else:
-            text += f"; {-difference.value:.3f} lower than at stride {_by_ratio(self.results)[1]}"
+            text += f"; {-difference.value:.3f} lower than at stride {_sort_by_ratio(self.results)[1]}"
             if difference.has_interval:
                 text += f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})"
-            text += (
-                ""
-                if self.is_certain
-                else f", not significant with {counted(best.episodes, 'episode')}; measure more episodes"
-            )
+            if not self.is_certain:
+                text += f", not significant with {counted(best.episodes, 'episode')}; measure more episodes"
         if best.ratio.value >= 1:
             return f"{text}. The model is not better than persistence at any stride. Check that it fits these data."
         return f"{text}."
@@ -266,22 +263,22 @@ class Calibration:
         }
 
 
-def _by_ratio(results: Mapping[int, VariantResult]) -> list[int]:
-    """Return the strides, the best one first."""
+def _sort_by_ratio(results: Mapping[int, VariantResult]) -> list[int]:
+    """Return the strides, sorted by their error relative to persistence, the lowest first."""
     return sorted(results, key=lambda stride: results[stride].ratio.value)
 
 
 def calibrate_config(
     config: Config, sample: ClipSample, *, model: str | None = None, reporter: Reporter = SILENT
 ) -> Calibration:
-    """Calibrate the model of a config, or another one, on the config's data.
+    """Calibrate the stride for the model of a config, or another model, on the data of the config.
 
-    A latent cache contains only the frames of clips at one stride, so frames are encoded here.
+    Frames are encoded here, because a latent cache contains only the clips at one stride.
 
     Args:
-        config: The config with data, model, device and precision.
+        config: The config for data, model, device and precision.
         sample: The clips at each stride.
-        model: Another model in a form that `model.base` accepts, or the folder of a run.
+        model: Another model in a form that `model.base` accepts, or the folder of a run; None: the config's model.
         reporter: Shows the progress of indexing and measuring.
 
     Raises:
@@ -302,7 +299,7 @@ def calibrate_model(
     sample: ClipSample,
     progress: Progress = no_progress,
 ) -> Calibration:
-    """Calibrate the stride for a model that is on the accelerator's device, in the run's precision.
+    """Calibrate the stride for a loaded model, on the accelerator's device and in its precision.
 
     Raises:
         InputError: As for `calibrate`, or the data are a latent cache.
@@ -322,15 +319,15 @@ def calibrate(
 ) -> Calibration:
     """Measure a model's one-step error relative to persistence at each stride.
 
-    A stride is possible if its clips fit into at least two episodes (or one, if no stride fits into two). All possible
-    strides are measured at the starts from which a clip of the largest stride fits.
+    A stride is possible if its clips fit into at least two episodes, or into one if no stride fits into two. All
+    possible strides are measured at the same starts: those from which a clip at the largest possible stride fits.
 
     Args:
         model: The predictor.
         encode: Encodes the frames.
         dataset: The data set; its own stride is ignored.
         sample: The clips at each stride.
-        progress: Called with (clips done, clips in total).
+        progress: Called with the number of measured clips and the total number.
 
     Raises:
         InputError: The split is empty, no stride fits into any of its episodes, or a clip cannot be read.
@@ -339,40 +336,41 @@ def calibrate(
     settings = dataset.config.model_copy(update={"frames": frames})
     strides = sample.strides or candidate_strides(rate)
     views = {stride: replace(dataset, config=settings.with_stride(stride)) for stride in strides}
-    possible, impossible = _possible(views, split)
+    possible, impossible = _find_possible_strides(views, split)
     windows = validation_windows(views[possible[-1]], split, clips=sample.clips)
-    widest_first = possible[::-1]
-    variants = [Variant(str(stride), partial(_at_stride, views[stride])) for stride in widest_first]
+    largest_first = possible[::-1]  # the first variant determines which clips can be read
+    variants = [Variant(str(stride), partial(_with_source, views[stride])) for stride in largest_first]
     clips = SameClips(dataset, windows, sample.batch_size)
-    errors = dict(zip(widest_first, measure_variants(model, encode, clips, variants, progress), strict=True))
+    errors = dict(zip(largest_first, measure_variants(model, encode, clips, variants, progress), strict=True))
     names = {stride: f"stride {stride} ({stride / rate:.2f} s)" for stride in possible}
-    results = {stride: result_of(errors[stride], name) for stride, name in names.items()}
+    results = {stride: compute_result(errors[stride], name) for stride, name in names.items()}
     if len(results) > 1:
-        best, second, *_ = _by_ratio(results)
-        results[best] = result_of(errors[best], names[best], reference=errors[second])
+        best, second, *_ = _sort_by_ratio(results)
+        results[best] = compute_result(errors[best], names[best], reference=errors[second])
     return Calibration(results, impossible, frames, split, rate)
 
 
-def _at_stride(view: Dataset, dataset: Dataset) -> Dataset:
+def _with_source(view: Dataset, dataset: Dataset) -> Dataset:
+    """Return the view with the source of the data set, which keeps episodes in memory."""
     return replace(view, source=dataset.source)
 
 
-def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[int, str]]:
-    """Return the strides whose clips fit into enough episodes, and the reasons for all other strides."""
-    fitting, reasons = {}, {}
+def _find_possible_strides(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[int, str]]:
+    """Return the strides whose clips fit into enough episodes, and the reasons against all other strides."""
+    num_episodes, reasons = {}, {}
     for stride, dataset in views.items():
         try:
-            fitting[stride] = len(np.unique(dataset.windows(split).episodes))
+            num_episodes[stride] = len(np.unique(dataset.windows(split).episodes))
         except InputError as error:
             reasons[stride] = f"{error.found}. Expected {error.needed}" if error.needed else error.found
             if len(reasons) == len(views):
                 raise
-    needed = min(_EPISODES_NEEDED, max(fitting.values()))
-    for stride, episodes in fitting.items():
+    needed = min(_MIN_EPISODES_FOR_INTERVAL, max(num_episodes.values()))
+    for stride, episodes in num_episodes.items():
         if episodes < needed:
             steps = counted(views[stride].config.clip_steps, "control step")
-            reasons[stride] = f"a clip of {steps} fits into 1 episode only"
-    return [stride for stride in fitting if stride not in reasons], dict(sorted(reasons.items()))
+            reasons[stride] = f"a clip of {steps} fits into only 1 episode"
+    return [stride for stride in num_episodes if stride not in reasons], dict(sorted(reasons.items()))
 
 
 def choose_stride(
@@ -380,14 +378,14 @@ def choose_stride(
 ) -> tuple[WorldModel, Calibration]:
     """Load the base model of a run whose `data.stride` is auto, and calibrate the stride.
 
-    Only candidates whose clips fit into the episodes are measured. The result is the same in all processes.
+    Only candidate strides whose clips fit into the episodes are measured. All processes get the same result.
 
     Raises:
         InputError: The base model is random, no candidate fits, or as for `calibrate_model`.
     """
     world_model = load_named(config, dataset, None).to(accelerator.device)
     reporter.note("data.stride is auto: measuring the model at each candidate stride")
-    fitting, errors = [], []
+    possible, errors = [], []
     for stride in candidate_strides(dataset.control_rate_hz):
         view = dataset.with_stride(stride)
         try:
@@ -396,10 +394,10 @@ def choose_stride(
             errors.append(error)
             reporter.note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
         else:
-            fitting.append(stride)
-    if not fitting:
+            possible.append(stride)
+    if not possible:
         raise errors[0]
-    sample = ClipSample(clips=config.validation.clips, strides=tuple(fitting))
+    sample = ClipSample(clips=config.validation.clips, strides=tuple(possible))
     calibration = calibrate_model(world_model, dataset, config, accelerator, sample)
     for result in calibration.results.values():
         reporter.note(f"  {result.name}: error relative to persistence {result.ratio:.3f}")

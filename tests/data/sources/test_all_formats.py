@@ -24,7 +24,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.inspection.excerpts import excerpts_of
+from vjepa2_ac.inspection.excerpts import read_excerpts
 from vjepa2_ac.inspection.statistics import inspect_dataset
 from vjepa2_ac.simulation.droid_writer import write_droid_rlds
 from vjepa2_ac.storage import retries
@@ -179,7 +179,7 @@ def find_call_site() -> CallSite:
 def run_all_readers(dataset: Dataset) -> None:
     """Read clips, sample episodes and measure them, as training, `data check` and `data inspect` do."""
     clips(dataset, 2)
-    assert list(excerpts_of(dataset))
+    assert list(read_excerpts(dataset))
     inspect_dataset(dataset)
 
 
