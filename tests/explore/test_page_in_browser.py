@@ -1,4 +1,4 @@
-"""The page of explore in a real browser: with mouse, with keys, on a phone, and after errors."""
+"""The page of `explore` in a real browser: with mouse, with keys, on a phone, and after a lost connection."""
 
 import re
 from collections.abc import Iterator
@@ -14,20 +14,20 @@ LARGE, PHONE = {"width": 1400, "height": 900}, {"width": 390, "height": 844}
 
 
 @pytest.fixture(scope="module")
-def started() -> Iterator[Any]:
-    with chromium() as one:
-        yield one
+def browser() -> Iterator[Any]:
+    with chromium() as started:
+        yield started
 
 
 @pytest.fixture
-def open_page(started: Any) -> Iterator[Any]:
+def open_page(browser: Any) -> Iterator[Any]:
     """Return a function that opens a page; afterwards the pages must not have reported any error."""
     contexts, errors = [], []
 
     def open_page_at(url: str, **context: Any) -> Any:
-        contexts.append(started.new_context(**{"viewport": LARGE, **context}))
-        page, wrong = open_watched_page(contexts[-1])
-        errors.append(wrong)
+        contexts.append(browser.new_context(**{"viewport": LARGE, **context}))
+        page, page_errors = open_watched_page(contexts[-1])
+        errors.append(page_errors)
         page.goto(url)
         wait_for_steps(page, 0)
         return page
@@ -74,7 +74,7 @@ def test_action_changes_all_images_and_undo_restores_them(live: Views, open_page
         page.get_by_role("button", name=re.compile("left$")).first.click()
         wait_for_steps(page, 1)
         after = [get_pixels(page, of) for of in ("base", "adapter", "truth")]
-        assert all(one != other for one, other in zip(before, after, strict=True))
+        assert all(old != new for old, new in zip(before, after, strict=True))
         assert re.search(r"error \d\.\d+.*persistence \d\.\d+", role(page, "sentence").inner_text())
         assert re.search(r"turn left \d\.\d°: ", role(page, "sentence").inner_text())
         role(page, "undo").click()
@@ -151,21 +151,21 @@ def test_page_fits_the_width_of_a_phone(live: Views, open_page: Any) -> None:
         assert page.evaluate("document.documentElement.scrollWidth") <= 360
 
 
-def test_page_reconnects_and_keeps_its_state(live: Views, started: Any) -> None:
-    context = started.new_context()
-    page, _ = open_watched_page(context)  # the browser may report the lost socket as an error
+def test_page_reconnects_and_keeps_its_state(live: Views, browser: Any) -> None:
+    context = browser.new_context()
+    page, _ = open_watched_page(context)  # its errors are ignored: the browser may report the lost socket
     with serving(live) as url:
         page.goto(url)
         wait_for_steps(page, 0)
         page.keyboard.press("a")
         wait_for_steps(page, 1)
-        seen = get_pixels(page, "adapter")
+        before = get_pixels(page, "adapter")
     role(page, "disconnected").wait_for(state="visible")
     assert "No connection to the server" in role(page, "disconnected").inner_text()
     with serving(live, port=int(url.rstrip("/").rpartition(":")[2])):
         role(page, "disconnected").wait_for(state="hidden")
         wait_for_steps(page, 1)
-        assert get_pixels(page, "adapter") == seen
+        assert get_pixels(page, "adapter") == before
         page.keyboard.press("a")
         wait_for_steps(page, 2)
     context.close()
@@ -174,7 +174,7 @@ def test_page_reconnects_and_keeps_its_state(live: Views, started: Any) -> None:
 def test_markup_in_episode_names_is_shown_as_text(live: Views, open_page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     name = "<img src=x onerror=alert(1)>\x1b[31m<script>alert(2)<b>"
     monkeypatch.setattr(type(live.explorer), "get_episode_name", lambda _self, number: f"{name}{number}")
-    with serving(replace(live)) as url:  # names are cached
+    with serving(replace(live)) as url:  # a copy without cached names
         page = open_page(url)
         page.keyboard.press("a")
         wait_for_steps(page, 1)

@@ -23,7 +23,7 @@ def get(url: str, path: str, **headers: str) -> http.client.HTTPResponse:
     return response
 
 
-def socket(url: str, origin: str | None = None, **headers: str) -> Any:
+def open_socket(url: str, origin: str | None = None, **headers: str) -> Any:
     return connect(
         url.replace("http", "ws") + "socket", origin=url.rstrip("/") if origin is None else origin or None,  # type: ignore[arg-type]
         additional_headers=headers, max_size=None,
@@ -32,10 +32,10 @@ def socket(url: str, origin: str | None = None, **headers: str) -> Any:
 
 def test_page_is_served_with_a_content_security_policy(recorded: Views) -> None:
     with serving(recorded) as url:
-        page = get(url, "/")
-        assert page.status == 200
-        assert page.getheader("Content-Type") == "text/html; charset=utf-8"
-        assert "default-src 'none'" in (page.getheader("Content-Security-Policy") or "")
+        response = get(url, "/")
+        assert response.status == 200
+        assert response.getheader("Content-Type") == "text/html; charset=utf-8"
+        assert "default-src 'none'" in (response.getheader("Content-Security-Policy") or "")
         assert get(url, "/explore.js").getheader("Content-Type") == "text/javascript; charset=utf-8"
         for path in ("/../server.py", "/%2e%2e/server.py", "//etc/passwd", "/socket.html", "/watch.html"):
             assert get(url, path).status == 404
@@ -44,7 +44,7 @@ def test_page_is_served_with_a_content_security_policy(recorded: Views) -> None:
 @pytest.mark.parametrize("origin", ["http://other.example", "null", "", "http://127.0.0.1:1", "http://["])
 def test_socket_rejects_other_origins(recorded: Views, origin: str) -> None:
     with serving(recorded) as url, pytest.raises(InvalidStatus) as rejection:
-        socket(url, origin)
+        open_socket(url, origin)
     assert rejection.value.response.status_code == 403
 
 
@@ -52,12 +52,12 @@ def test_unknown_host_name_gets_no_page(recorded: Views) -> None:
     with serving(recorded) as url:
         assert get(url, "/", Host="rebound.example").status == 403
         with pytest.raises(InvalidStatus):
-            socket(url, "http://rebound.example", Host="rebound.example")
+            open_socket(url, "http://rebound.example", Host="rebound.example")
 
 
 def test_newest_request_gets_a_reply_and_cancels_a_search(recorded: Views) -> None:
     goal = {"episode": 0, "step": 6}
-    with serving(recorded) as url, socket(url) as page:
+    with serving(recorded) as url, open_socket(url) as page:
         page.recv()
         page.send(json.dumps({"seq": 1, "kind": "plan", "goal": goal, "model": "base", "steps": 8}))
         for seq in range(2, 30):
@@ -70,7 +70,7 @@ def test_newest_request_gets_a_reply_and_cancels_a_search(recorded: Views) -> No
 
 
 def test_invalid_request_gets_an_error_and_the_next_one_gets_a_reply(recorded: Views) -> None:
-    with serving(recorded) as url, socket(url) as page:
+    with serving(recorded) as url, open_socket(url) as page:
         page.recv()
         for invalid in ("{}", b"\x00", "[" * 1000, json.dumps({"seq": 1, "kind": "predict", "episode": 999})):
             page.send(invalid)
@@ -83,7 +83,7 @@ def test_internal_error_is_logged_and_the_next_request_gets_a_reply(
     recorded: Views, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(Views, "_make_episode_reply", lambda *_: 1 / 0)
-    with serving(recorded) as url, socket(url) as page:
+    with serving(recorded) as url, open_socket(url) as page:
         page.recv()
         page.send(json.dumps({"seq": 1, "kind": "episode"}))
         assert "Internal error" in header(page.recv())["text"]

@@ -146,7 +146,7 @@ def test_cancelled_simulation_stops_before_the_next_action(live: Views) -> None:
     with pytest.raises(SearchCancelledError):
         live.reply_to(request, no_progress, cancelled)
     assert len(calls) == 3
-    again, images = parse_message(live.reply_to(request, no_progress, lambda: False))
-    other, expected = get_reply(live, kind="predict", start=2, actions=actions)
-    assert again["truth_state"] == other["truth_state"]
-    np.testing.assert_array_equal(images["truth"], expected["truth"])
+    content, images = parse_message(live.reply_to(request, no_progress, lambda: False))
+    expected_content, expected_images = get_reply(live, kind="predict", start=2, actions=actions)
+    assert content["truth_state"] == expected_content["truth_state"]
+    np.testing.assert_array_equal(images["truth"], expected_images["truth"])

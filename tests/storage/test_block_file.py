@@ -23,8 +23,8 @@ MB = 1 << 20
 DATA = bytes(i * 7 % 251 for i in range(3000))
 
 
-class Served:
-    """Bytes with a counter of fetches."""
+class FetchRecorder:
+    """A file in memory that records the fetched ranges."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.fetches = data, []
@@ -52,64 +52,64 @@ def test_reading_and_seeking_equal_those_of_a_file_in_memory(size: int, steps: l
         patch.setattr(block_file, "BLOCK_BYTES", 64)
         patch.setattr(block_file, "_CACHED_BLOCKS", 8)
         data = DATA[:size]
-        ours, theirs = Served(data).file, io.BytesIO(data)
+        file, reference = FetchRecorder(data).file, io.BytesIO(data)
         for kind, number in steps:
             if kind == "set":
-                assert ours.seek(max(number, 0)) == theirs.seek(max(number, 0))
+                assert file.seek(max(number, 0)) == reference.seek(max(number, 0))
             elif kind == "end":
-                assert ours.seek(-min(number, size), os.SEEK_END) == theirs.seek(-min(number, size), os.SEEK_END)
+                assert file.seek(-min(number, size), os.SEEK_END) == reference.seek(-min(number, size), os.SEEK_END)
             elif kind == "read":
-                assert ours.read(number) == theirs.read(number)
+                assert file.read(number) == reference.read(number)
             else:
-                mine, its = bytearray(max(number, 0)), bytearray(max(number, 0))
-                assert ours.readinto(mine) == theirs.readinto(its)
-                assert mine == its
-            assert ours.tell() == theirs.tell()
+                buffer, expected = bytearray(max(number, 0)), bytearray(max(number, 0))
+                assert file.readinto(buffer) == reference.readinto(expected)
+                assert buffer == expected
+            assert file.tell() == reference.tell()
 
 
 def test_seek_fetches_one_block_and_cached_blocks_none() -> None:
-    served = Served(bytes(100 * MB))
-    served.file.read(32)
-    served.file.seek(-50_000, os.SEEK_END)
-    served.file.read(50_000)
-    served.file.seek(50 * MB)
-    served.file.read(40_000)
-    assert served.bytes <= 5 * 128 * 1024
-    before = len(served.fetches)
-    served.file.seek(5)
-    served.file.read(32)
-    assert len(served.fetches) == before
+    recorder = FetchRecorder(bytes(100 * MB))
+    recorder.file.read(32)
+    recorder.file.seek(-50_000, os.SEEK_END)
+    recorder.file.read(50_000)
+    recorder.file.seek(50 * MB)
+    recorder.file.read(40_000)
+    assert recorder.bytes <= 5 * 128 * 1024
+    before = len(recorder.fetches)
+    recorder.file.seek(5)
+    recorder.file.read(32)
+    assert len(recorder.fetches) == before
 
 
 def test_sequential_reads_double_the_fetch_size() -> None:
-    served = Served(bytes(64 * MB))
-    while served.file.read(32 * 1024):
+    recorder = FetchRecorder(bytes(64 * MB))
+    while recorder.file.read(32 * 1024):
         pass
-    assert len(served.fetches) <= 24
-    assert served.bytes == 64 * MB
-    served = Served(bytes(64 * MB))
-    served.file.seek(10 * MB + 5)
-    assert len(served.file.read(7 * MB)) == 7 * MB
-    assert len(served.fetches) == 1
-    assert served.bytes <= 7 * MB + 2 * 128 * 1024
+    assert len(recorder.fetches) <= 24
+    assert recorder.bytes == 64 * MB
+    recorder = FetchRecorder(bytes(64 * MB))
+    recorder.file.seek(10 * MB + 5)
+    assert len(recorder.file.read(7 * MB)) == 7 * MB
+    assert len(recorder.fetches) == 1
+    assert recorder.bytes <= 7 * MB + 2 * 128 * 1024
 
 
 def test_block_is_fetched_once_per_machine_and_version(gcs: Gcs, tmp_path: Path) -> None:
     data = os.urandom(5 * BLOCK_BYTES + 77)
     url, cache = gcs.put("bucket/file", data), DiskCache(tmp_path, 10 * MB)
 
-    def opened(version: str = "1") -> BlockCachedFile:
+    def open_file(version: str = "1") -> BlockCachedFile:
         return BlockCachedFile(url, version=version, size=len(data), cache=cache)
 
-    first = opened()
+    first = open_file()
     first.seek(2 * BLOCK_BYTES + 5)
     assert first.read(10) == data[2 * BLOCK_BYTES + 5 :][:10]
     before = storage.bytes_fetched()
-    assert opened().read() == data
+    assert open_file().read() == data
     assert storage.bytes_fetched() - before == len(data) - BLOCK_BYTES
-    assert opened().read() == data
+    assert open_file().read() == data
     assert storage.bytes_fetched() - before == len(data) - BLOCK_BYTES
-    opened("2").read(1)
+    open_file("2").read(1)
     assert storage.bytes_fetched() - before == len(data)
     gcs.fail_next(404, times=9)
     broken = BlockCachedFile(url, version="3", size=len(data), cache=cache)
@@ -125,7 +125,7 @@ def entries(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "lock")
 
 
-def size_of(folder: Path) -> int:
+def compute_size(folder: Path) -> int:
     return sum(path.stat().st_size for path in entries(folder))
 
 
@@ -141,7 +141,7 @@ def test_entry_is_readable_by_each_cache_of_the_folder(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for damaged in (b"", whole[:-1], b"S" + whole[1:], bytes(len(whole))):
         path.write_bytes(damaged)
-        assert cache.read("gs://a/b 0-10") is None, "as after a power cut"
+        assert cache.read("gs://a/b 0-10") is None, "such as after a power failure"
 
 
 def test_parts_are_read_by_number_and_damaged_entries_are_absent(tmp_path: Path) -> None:
@@ -153,8 +153,8 @@ def test_parts_are_read_by_number_and_damaged_entries_are_absent(tmp_path: Path)
     assert cache.read_parts("a", 4, [4]) is None
     path = cache._path("a")
     data = path.read_bytes()
-    for place in (*range(0, 80, 3), data.index(b"thirdthird") + 7):  # the table of the parts, and a part
-        path.write_bytes(data[:place] + bytes([data[place] ^ 255]) + data[place + 1 :])
+    for index in (*range(0, 80, 3), data.index(b"thirdthird") + 7):  # in the table of the parts, and in a part
+        path.write_bytes(data[:index] + bytes([data[index] ^ 255]) + data[index + 1 :])
         assert cache.read_parts("a", 4, [0, 1, 2, 3]) is None
         assert cache.read_parts("a", 4, [3]) in (None, [b"last"])
     path.write_bytes(data[:-20])
@@ -169,10 +169,10 @@ def test_least_recently_used_entry_is_evicted_first(tmp_path: Path) -> None:
         before = set(entries(tmp_path))
         cache.write(key, bytes(96))
         [new] = set(entries(tmp_path)) - before
-        os.utime(new, (second, second))  # the clock of a file system is coarse
+        os.utime(new, (second, second))  # because the time stamps of file systems are coarse
     assert cache.read("a") is not None
     cache.write("e", bytes(96))
-    assert [key for key in "abcde" if cache.read(key) is not None] == ["a", "d", "e"], "one more, for room"
+    assert [key for key in "abcde" if cache.read(key) is not None] == ["a", "d", "e"], "evicted to 80 % of the limit"
 
 
 @settings(max_examples=30)
@@ -185,10 +185,10 @@ def test_size_limit_holds_and_newest_entry_is_present(
     folder = tmp_path_factory.mktemp("cache")
     cache = DiskCache(folder, 1000)
     for key, size in writes:
-        cache = cache if is_shared else DiskCache(folder, 1000)  # as in as many processes
+        cache = cache if is_shared else DiskCache(folder, 1000)  # a new cache object, as in another process
         cache.write(f"{key} {size}", bytes(size))
         assert (cache.read(f"{key} {size}") == bytes(size)) == (size + 4 <= 800)
-        assert size_of(folder) <= 1000
+        assert compute_size(folder) <= 1000
     DiskCache(folder / "none", 0).write("a", b"1")
     assert not (folder / "none").exists()
 
@@ -201,11 +201,11 @@ def test_unwritable_disk_logs_one_warning(
     folder = tmp_path / "file" / "inner" if fault == "no folder" else tmp_path / "cache"
     cache = DiskCache(folder, 1000)
 
-    def full(*_: object) -> None:
+    def raise_disk_full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     if fault == "full":
-        monkeypatch.setattr(Path, "replace", full)
+        monkeypatch.setattr(Path, "replace", raise_disk_full)
     cache.write("a", b"first")
     cache.write("b", b"second")
     assert cache.read("a") is None
@@ -222,15 +222,15 @@ def fill(folder: Path, entries: int) -> None:
         os.utime(new, (key, key))
 
 
-@pytest.mark.parametrize("is_unknown", [False, True], ids=["known total", "total of an earlier version"])
+@pytest.mark.parametrize("is_unknown", [False, True], ids=["known total", "unknown total"])
 def test_first_write_reduces_a_folder_over_the_limit(tmp_path: Path, *, is_unknown: bool) -> None:
     fill(tmp_path, 20)
     if is_unknown:
         (tmp_path / "lock").write_bytes(b"")
     cache = DiskCache(tmp_path, 1000)
-    assert size_of(tmp_path) == 2000
+    assert compute_size(tmp_path) == 2000
     cache.write("new", bytes(96))
-    assert size_of(tmp_path) == 800
+    assert compute_size(tmp_path) == 800
     assert cache.read("new") is not None
     assert cache.read("0") is None
     assert cache.read("18") is not None
@@ -243,7 +243,7 @@ def test_zero_limit_and_no_limit_evict_nothing(tmp_path: Path) -> None:
         cache.write("new", bytes(96))
         assert cache.read("0") == bytes(96)
         assert (cache.read("new") is None) == (limit == 0)
-    assert size_of(tmp_path) == 2100
+    assert compute_size(tmp_path) == 2100
 
 
 WRITE_MANY = """
@@ -254,25 +254,25 @@ from vjepa2_ac.storage.block_file import DiskCache
 cache = DiskCache(sys.argv[1], int(sys.argv[2]))
 first = int(sys.argv[3])
 
-def once(number):
+def write_and_read(number):
     key = (first + number) % 250
     cache.write(str(key), bytes([key]) * (1 + key))
     other = number * 7 % 250
     assert cache.read(str(other)) in (None, bytes([other]) * (1 + other))
 
 with ThreadPoolExecutor(2) as pool:
-    list(pool.map(once, range(300)))
+    list(pool.map(write_and_read, range(300)))
 """
 
 
 def test_size_limit_holds_with_concurrent_writers(popen: Popen, tmp_path: Path) -> None:
-    limit, most_in_progress = 20_000, 4 * 2 * 255  # of 33,000 bytes
+    limit, max_in_progress = 20_000, 4 * 2 * 255  # all entries have 33,000 bytes
     writers = [
         popen([sys.executable, "-c", WRITE_MANY, str(tmp_path), str(limit), str(60 * first)]) for first in range(4)
     ]
     assert [writer.wait(timeout=120) for writer in writers] == [0] * 4
-    assert size_of(tmp_path) <= limit + most_in_progress
-    assert size_of(tmp_path) > limit / 2
+    assert compute_size(tmp_path) <= limit + max_in_progress
+    assert compute_size(tmp_path) > limit / 2
     assert not list(tmp_path.rglob("*.partial"))
 
 

@@ -1,4 +1,4 @@
-"""Files: complete or absent, also after a kill; URLs are read like local paths."""
+"""A written file is complete or absent, even after SIGKILL; URLs are read like local paths."""
 
 import errno
 import os
@@ -42,8 +42,8 @@ def names(folder: Path) -> list[str]:
 
 
 def age(path: Path, days: float) -> None:
-    for one in (path, *path.rglob("*")):
-        os.utime(one, (time.time() - days * 86_400,) * 2)
+    for entry in (path, *path.rglob("*")):
+        os.utime(entry, (time.time() - days * 86_400,) * 2)
 
 
 # ---- one file ----
@@ -56,32 +56,32 @@ def test_file_appears_when_complete_and_failed_write_keeps_the_old_file(tmp_path
         file.flush()
         assert not target.exists()
 
-    def write_half() -> None:
+    def write_incompletely() -> None:
         with storage.atomic_writer(target) as file:
             file.write(b"new, but not ")
             raise RuntimeError
 
     with pytest.raises(RuntimeError):
-        write_half()
+        write_incompletely()
     assert target.read_text(encoding="utf-8") == "Grüße"
     assert names(target.parent) == ["file"]
     storage.write_atomically(tmp_path / ("ü" * 127), "a long name")
 
 
 def test_full_disk_error_names_the_file(tmp_path: Path) -> None:
-    full = OSError(errno.ENOSPC, "No space left on device")
+    disk_full = OSError(errno.ENOSPC, "No space left on device")
     with (
         pytest.raises(OSError, match=r"No space left on device: '.*a\.json'"),
         storage.atomic_writer(tmp_path / "a.json"),
     ):
-        raise full
+        raise disk_full
     with (
         pytest.raises(InputError, match=r"^a: cannot be written: .*Free some space"),
         storage.translate_write_errors("a"),
     ):
-        raise full
+        raise disk_full
     with pytest.raises(ConnectionResetError), storage.translate_write_errors("a"):
-        raise ConnectionResetError(errno.ECONNRESET, "not about writing")
+        raise ConnectionResetError(errno.ECONNRESET, "an error that is not related to writing")
 
 
 # ---- a folder ----
@@ -119,19 +119,19 @@ def test_existing_folder_keeps_its_other_files(tmp_path: Path, monkeypatch: pyte
 
 def test_failed_move_leaves_no_manifest(tmp_path: Path) -> None:
     (tmp_path / "manifest").write_text("old")
-    (tmp_path / "a").mkdir()  # target of a write
+    (tmp_path / "a").mkdir()  # in the way of the file `a`
     (tmp_path / "a" / "mine").write_text("precious")
     with pytest.raises(InputError, match=r"cannot be written: .*directory"):
         fill(tmp_path, "a", "manifest")
     assert names(tmp_path) == ["a"]
 
 
-@pytest.mark.parametrize("place", ["file", "file/inner", "/proc/inner"])
-def test_path_that_cannot_be_a_folder_raises(tmp_path: Path, place: str) -> None:
+@pytest.mark.parametrize("name", ["file", "file/inner", "/proc/inner"])
+def test_path_that_cannot_be_a_folder_raises(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match=rf"{place}: cannot be written: .*Choose a path") as caught:
-        fill(tmp_path / place, "manifest")
-    assert caught.value.where == str(tmp_path / place)
+    with pytest.raises(InputError, match=rf"{name}: cannot be written: .*Choose a path") as caught:
+        fill(tmp_path / name, "manifest")
+    assert caught.value.where == str(tmp_path / name)
 
 
 # ---- interrupted writers ----
@@ -145,11 +145,11 @@ def test_incomplete_file_never_has_its_final_name(tmp_path: Path, popen: Popen, 
     assert process.stdout.readline() == b"writing\n"
     process.send_signal(number)
     assert process.wait(timeout=120) == -number
-    left = names(tmp_path)
-    assert len(left) == (number == signal.SIGKILL), "a writer that is told to end leaves nothing"
+    remaining = names(tmp_path)
+    assert len(remaining) == (number == signal.SIGKILL), "a writer that receives another signal removes its files"
     assert storage.is_empty(tmp_path)
     remove_abandoned.__wrapped__(tmp_path)
-    assert names(tmp_path) == left, "another writer may be at work on it"
+    assert names(tmp_path) == remaining, "another process may still write a recent file"
     for path in tmp_path.iterdir():
         age(path, days=1.1)
     remove_abandoned.__wrapped__(tmp_path)
@@ -190,12 +190,12 @@ def test_partial_file_of_another_machine_survives_a_clock_jump(
 
 @pytest.fixture(params=["local", "memory"])
 def folder(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """A folder with two files, local or behind a URL."""
-    place = str(tmp_path) if request.param == "local" else f"memory://{tmp_path.name}"
+    """Return a folder with two files, local or behind a URL."""
+    path = str(tmp_path) if request.param == "local" else f"memory://{tmp_path.name}"
     filesystem = fsspec.filesystem("file" if request.param == "local" else "memory")
     for name, data in (("b", b"0123456789"), ("a", b"")):
-        filesystem.pipe_file(storage.join(place, name), data)
-    return place
+        filesystem.pipe_file(storage.join(path, name), data)
+    return path
 
 
 def test_url_is_read_like_a_local_folder(folder: str) -> None:

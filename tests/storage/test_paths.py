@@ -13,14 +13,14 @@ from vjepa2_ac.config.loading import all_keys, config_as_flat_dict, parse_config
 from vjepa2_ac.data.index import cache_folder
 from vjepa2_ac.errors import InputError
 
-ON_THIS_MACHINE = (
+LOCAL_PATH_KEYS = (
     "run_dir",
     "data.disk_cache.dir",
     "model.base",
     "model.encoder.path",
     "decoder.folder",
 )
-ANYWHERE = ("data.path", "data.cache_dir", "data.idle.ranges", "checkpoint.remote")
+OTHER_PATH_KEYS = ("data.path", "data.cache_dir", "data.idle.ranges", "checkpoint.remote")
 LOOK_LIKE_PATHS = ("dir", "path", "folder", "base", "remote", "ranges")  # last part of a key
 
 
@@ -29,10 +29,10 @@ def config_with(key: str, value: str) -> dict[str, Any]:
     if key == "data.idle.ranges":
         values["data"]["idle"] = {"rule": "published"}
     *sections, name = key.split(".")
-    inside = values
+    section_values = values
     for section in sections:
-        inside = inside.setdefault(section, {})
-    inside[name] = value
+        section_values = section_values.setdefault(section, {})
+    section_values[name] = value
     return values
 
 
@@ -41,30 +41,30 @@ def read(key: str, value: str) -> str:
 
 
 def test_all_path_keys_are_covered() -> None:
-    keys = {key for key in all_keys() if not key.startswith("replay.data.")}  # the same ones as of data
-    found = {key for key in keys if key.split(".")[-1].endswith(LOOK_LIKE_PATHS)}
-    found.remove("training.allow_weak_base")
-    assert found == {*ON_THIS_MACHINE, *ANYWHERE}
+    keys = {key for key in all_keys() if not key.startswith("replay.data.")}  # the same keys as in data
+    path_keys = {key for key in keys if key.split(".")[-1].endswith(LOOK_LIKE_PATHS)}
+    path_keys.remove("training.allow_weak_base")
+    assert path_keys == {*LOCAL_PATH_KEYS, *OTHER_PATH_KEYS}
 
 
-@pytest.mark.parametrize("key", [*ON_THIS_MACHINE, *ANYWHERE])
+@pytest.mark.parametrize("key", [*LOCAL_PATH_KEYS, *OTHER_PATH_KEYS])
 def test_all_path_keys_expand_the_home_folder(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/of/mine")
     assert read(key, "~/x/") == "/home/of/mine/x"
-    assert read(key, "./~/x") == "./~/x", "a folder may be called so"
+    assert read(key, "./~/x") == "./~/x", "a folder may have the name ~"
     for wrong in ("~nobody-at-all/x", " ", "gs:/bucket/x"):
         with pytest.raises(InputError, match=rf"  {key}: "):
             read(key, wrong)
 
 
-@pytest.mark.parametrize("key", ON_THIS_MACHINE)
+@pytest.mark.parametrize("key", LOCAL_PATH_KEYS)
 @pytest.mark.parametrize("url", ["gs://bucket/run", "file:///x", "S3://x"])
 def test_url_for_a_local_path_key_raises(key: str, url: str) -> None:
     with pytest.raises(InputError, match=rf"  {key}: is a URL .*{url}"):
         read(key, url)
 
 
-@pytest.mark.parametrize("key", ANYWHERE)
+@pytest.mark.parametrize("key", OTHER_PATH_KEYS)
 def test_url_is_unchanged_for_other_path_keys(key: str) -> None:
     assert read(key, "gs://bucket/~x/") == "gs://bucket/~x"
 
@@ -78,16 +78,17 @@ def test_cache_environment_variable_is_resolved_like_a_path_key(monkeypatch: pyt
         cache_folder(DiskCacheConfig())
 
 
-def test_all_path_options_are_resolved_the_same() -> None:
-    words = {"CONFIG", "FOLDER", "DIR", "PATH", "PNG", "IMAGE", "RUN", "MODEL", "RUN_OR_MODEL"}
-    found = 0
-    for command, action in ((words, one) for words, parser in _leaves(_parser(), ()) for one in parser._actions):
-        is_path = words & set(str(action.metavar).replace("|", " ").split())
+def test_all_path_options_use_the_same_resolution() -> None:
+    path_words = {"CONFIG", "FOLDER", "DIR", "PATH", "PNG", "IMAGE", "RUN", "MODEL", "RUN_OR_MODEL"}
+    num_path_options = 0
+    actions = ((words, action) for words, parser in _leaves(_parser(), ()) for action in parser._actions)
+    for command, action in actions:
+        is_path = path_words & set(str(action.metavar).replace("|", " ").split())
         if is_path and action.dest != "overrides":
-            found += 1
+            num_path_options += 1
             readers = {as_config, as_path, as_local, as_model, as_place}
             assert action.type in readers, f"{command}: {action.dest}"
-    assert found > 20
+    assert num_path_options > 20
 
 
 def test_path_option_expands_home_and_rejects_urls(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

@@ -69,7 +69,7 @@ def test_failed_retries_raise_with_attempts_url_and_reason(gcs: Gcs, file: str, 
     with pytest.raises(UnreachableError, match=rf"^{file}: 5 attempts in .* failed.*{message}.*Check the net"):
         storage.read_range(file, 0, 5)
     attempts = 5 if failure != "reset" else 10  # aiohttp retries at once if a reused connection was closed
-    assert len(gcs.reads()) <= attempts, "gcsfs would make six of each"
+    assert len(gcs.reads()) <= attempts, "gcsfs does not retry each attempt six times"
 
 
 @pytest.mark.parametrize("status", [401, 403])
@@ -111,7 +111,7 @@ def test_ranges_are_read_concurrently_and_returned_in_order(gcs: Gcs, file: str)
     assert len(gcs.reads()) == len(ranges)
 
 
-def test_long_read_is_split_into_pieces(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_read_is_split_into_parts(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vjepa2_ac.storage.remote._PART_BYTES", 1000)
     assert storage.read_bytes(file) == DATA
     assert len(gcs.reads()) == -(-len(DATA) // 1000)
@@ -165,7 +165,7 @@ def test_missing_protocol_library_raises_with_the_extra(url: str, extra: str, mo
 
 @pytest.fixture
 def no_google_login(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A machine without any login."""
+    """Simulate a machine without any login, and return the folder of its files."""
     for name in ("STORAGE_EMULATOR_HOST", "GOOGLE_APPLICATION_CREDENTIALS"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("CLOUDSDK_CONFIG", str(tmp_path))
@@ -187,7 +187,7 @@ def test_google_token_is_user_machine_or_anonymous(no_google_login: Path, monkey
     monkeypatch.setenv("GOOGLE_APPLICATION_CREDENTIALS", "key.json")
     assert remote.google_token() == "google_default"
     monkeypatch.setenv("STORAGE_EMULATOR_HOST", "http://127.0.0.1:1")
-    assert remote.google_token() == "anon", "an emulator is shown no login"
+    assert remote.google_token() == "anon", "an emulator never receives a login"
 
 
 def test_login_hint_matches_the_protocol() -> None:
@@ -195,7 +195,7 @@ def test_login_hint_matches_the_protocol() -> None:
     assert remote.login_hint("https://host/file") == "Check your login"
 
 
-AT_ONCE = RetryPolicy(attempts=3, first_wait_s=0.0, longest_wait_s=0.0)
+NO_WAIT = RetryPolicy(attempts=3, first_wait_s=0.0, longest_wait_s=0.0)
 
 
 @pytest.mark.parametrize("error", [TypeError("ours"), KeyError("ours"), AssertionError("ours")])
@@ -207,13 +207,13 @@ def test_programming_error_is_not_retried(error: Exception) -> None:
         raise error
 
     with pytest.raises(type(error), match="ours"):
-        call_with_retries("gs://a", action, policy=AT_ONCE, access="")
-    assert calls == [AT_ONCE.timeout_s]
+        call_with_retries("gs://a", action, policy=NO_WAIT, access="")
+    assert calls == [NO_WAIT.timeout_s]
 
 
 class StatusError(Exception):
     def __init__(self, status: int) -> None:
-        super().__init__("as another library says it")
+        super().__init__("text of another library")
         self.response = type("Response", (), {"status_code": status})()
 
 
@@ -225,9 +225,9 @@ class NoCredentialsError(Exception):
     ("error", "attempts", "message"),
     [
         (ConnectionResetError("gone"), 3, "3 attempts in .* failed"),
-        (OSError(5, "of a library that we do not know"), 3, "3 attempts in .* failed"),
+        (OSError(5, "text of an unknown library"), 3, "3 attempts in .* failed"),
         (TimeoutError(), 3, "Last error: time-out"),
-        (StatusError(503), 3, "HTTP 503: as another library says it"),
+        (StatusError(503), 3, "HTTP 503: text of another library"),
         (json.JSONDecodeError("Unterminated string", '{"items": [{"na', 12), 3, "JSONDecodeError: Unterminated"),
         (RefreshError("the login service is down", retryable=True), 3, "the login service is down"),
         (RefreshError("invalid_grant: expired"), 1, "no permission.*expired.*Log in so"),
@@ -246,7 +246,7 @@ def test_library_errors_are_classified(error: Exception, attempts: int, message:
         raise error
 
     with pytest.raises(UnreachableError, match=message) as caught:
-        call_with_retries("gs://a", action, policy=AT_ONCE, access="Log in so")
+        call_with_retries("gs://a", action, policy=NO_WAIT, access="Log in so")
     assert len(calls) == attempts
     assert caught.value.__cause__ is error
     assert "\n" not in str(caught.value)
@@ -258,7 +258,7 @@ def test_lasting_network_failure_logs_one_warning(
     def action(_timeout_s: float) -> None:
         raise ConnectionResetError("gone")
 
-    def spoken(attempts: int) -> int:
+    def count_warnings(attempts: int) -> int:
         caplog.clear()
         policy = RetryPolicy(attempts=attempts, first_wait_s=0.0, longest_wait_s=0.0)
         with pytest.raises(UnreachableError):
@@ -266,8 +266,8 @@ def test_lasting_network_failure_logs_one_warning(
         return sum(record.levelname == "WARNING" for record in caplog.records)
 
     monkeypatch.setattr(retries, "_last_warning_s", [float("-inf")])
-    assert spoken(attempts=3) == 0  # two failures cause no warning
+    assert count_warnings(attempts=3) == 0  # two failures cause no warning
     with retries.suppress_retry_warnings():
-        assert spoken(attempts=6) == 0  # within `suppress_retry_warnings`
-    assert spoken(attempts=6) == 1
-    assert spoken(attempts=6) == 0  # the warning was logged less than 30 s ago
+        assert count_warnings(attempts=6) == 0  # within `suppress_retry_warnings`
+    assert count_warnings(attempts=6) == 1
+    assert count_warnings(attempts=6) == 0  # the warning was logged less than 30 s ago

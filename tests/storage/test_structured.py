@@ -102,7 +102,7 @@ def test_values_of_wrong_types_raise_with_their_names(values: dict[str, object],
 )
 def test_yaml_numbers_and_dates_are_read_as_intended(text: str, value: Any) -> None:
     assert parse_yaml(text, where="") == value
-    assert repr(parse_yaml(text, where="")) == repr(value)  # True is not 1
+    assert repr(parse_yaml(text, where="")) == repr(value)  # distinguishes True from 1
 
 
 def test_configs_are_read_as_pyyaml_reads_them() -> None:
@@ -114,7 +114,7 @@ def test_configs_are_read_as_pyyaml_reads_them() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "place", "complaint"),
+    ("text", "position", "complaint"),
     [
         ("a: 1\nb: 2\na: 3", ": line 3, column 1", "duplicate key 'a'"),
         ("a: &x [1, 2]\nb: [*x, *x]", ": line 2, column 5", "an alias"),
@@ -128,8 +128,8 @@ def test_configs_are_read_as_pyyaml_reads_them() -> None:
         ("a: " + "9" * 5000, "", "digits"),
     ],
 )
-def test_invalid_yaml_raises_with_line_and_column(text: str, place: str, complaint: str) -> None:
+def test_invalid_yaml_raises_with_line_and_column(text: str, position: str, complaint: str) -> None:
     with pytest.raises(InputError) as caught:
         parse_yaml(text, where="my.yaml")
-    assert str(caught.value).startswith(f"my.yaml{place}: invalid YAML")
+    assert str(caught.value).startswith(f"my.yaml{position}: invalid YAML")
     assert complaint in str(caught.value)

@@ -10,10 +10,10 @@ from vjepa2_ac import storage
 from vjepa2_ac.errors import RefusedError, UnreachableError
 from vjepa2_ac.storage import remote, retries
 
-SMALL, LARGE = 3000, 6 << 20  # gcsfs sends more than 5 MB in pieces
-PLACE = "gs://bucket/run/file"
+SMALL, LARGE = 3000, 6 << 20  # gcsfs sends more than 5 MB in parts
+URL = "gs://bucket/run/file"
 
-pytestmark = pytest.mark.filterwarnings("ignore:Sending a large body:ResourceWarning")  # aiohttp's view of gcsfs
+pytestmark = pytest.mark.filterwarnings("ignore:Sending a large body:ResourceWarning")  # aiohttp warns about gcsfs
 
 
 @pytest.fixture
@@ -34,10 +34,10 @@ def source_of(folder: Path, size: int) -> Path:
 @pytest.mark.parametrize("size", [0, SMALL, LARGE])
 def test_uploaded_file_is_read_back(tmp_path: Path, size: int) -> None:
     source = source_of(tmp_path, size)
-    storage.upload(source, PLACE)
-    assert storage.read_bytes(PLACE) == source.read_bytes()
+    storage.upload(source, URL)
+    assert storage.read_bytes(URL) == source.read_bytes()
     assert storage.file_sizes("gs://bucket/run") == {"file": size}
-    storage.download(PLACE, tmp_path / "copy")
+    storage.download(URL, tmp_path / "copy")
     assert (tmp_path / "copy").read_bytes() == source.read_bytes()
 
 
@@ -46,31 +46,31 @@ def test_uploaded_file_is_read_back(tmp_path: Path, size: int) -> None:
 def test_upload_survives_temporary_failures(bucket: Gcs, tmp_path: Path, size: int, failure: Failure) -> None:
     source = source_of(tmp_path, size)
     bucket.fail_next(failure, times=2, match="POST /upload/")
-    storage.upload(source, PLACE)
+    storage.upload(source, URL)
     assert bucket.faults_left == 0
-    assert storage.read_bytes(PLACE) == source.read_bytes()
+    assert storage.read_bytes(URL) == source.read_bytes()
 
 
 @pytest.mark.usefixtures("bucket")
-def test_failure_between_pieces_leaves_nothing_and_restarts_the_upload(
+def test_failure_between_parts_leaves_nothing_and_restarts_the_upload(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(remote, "_PART_BYTES", 2 << 20)
     source = source_of(tmp_path, LARGE)
-    begun = []
-    answer = Gcs._failure_of
+    requests = []
+    original = Gcs._failure_of
 
-    def fail_second_piece(gcs: Gcs, target: str) -> Failure | None:
+    def fail_second_part(gcs: Gcs, target: str) -> Failure | None:
         if "upload_id" in target and target.startswith("POST"):
-            begun.append(target)
-            if len(begun) == 2:
+            requests.append(target)
+            if len(requests) == 2:
                 return 503
-        return answer(gcs, target)
+        return original(gcs, target)
 
-    monkeypatch.setattr(Gcs, "_failure_of", fail_second_piece)
-    storage.upload(source, PLACE)
-    assert storage.read_bytes(PLACE) == source.read_bytes()
-    assert len(begun) == 2 + 3, "two of the first attempt, three of the second"
+    monkeypatch.setattr(Gcs, "_failure_of", fail_second_part)
+    storage.upload(source, URL)
+    assert storage.read_bytes(URL) == source.read_bytes()
+    assert len(requests) == 2 + 3, "two in the first attempt, three in the second"
 
 
 def test_stalled_upload_times_out_and_is_retried(bucket: Gcs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,11 +78,11 @@ def test_stalled_upload_times_out_and_is_retried(bucket: Gcs, tmp_path: Path, mo
     monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=100, first_wait_s=0.0, timeout_s=0.3))
     source = source_of(tmp_path, SMALL)
     bucket.fail_next("hang", match="POST /upload/")
-    storage.upload(source, PLACE)
+    storage.upload(source, URL)
     monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=2, first_wait_s=0.0, timeout_s=0.3))
     bucket.fail_next("hang", times=100, match="POST /upload/")
     with pytest.raises(UnreachableError, match="2 attempts in") as raised:
-        storage.upload(source, PLACE)
+        storage.upload(source, URL)
     assert not isinstance(raised.value, RefusedError)
 
 
@@ -93,7 +93,7 @@ def test_stalled_upload_times_out_and_is_retried(bucket: Gcs, tmp_path: Path, mo
 def test_refused_upload_is_not_retried(bucket: Gcs, tmp_path: Path, failure: int, message: str) -> None:
     bucket.fail_next(failure, times=9)
     with pytest.raises(RefusedError, match=message):
-        storage.upload(source_of(tmp_path, SMALL), PLACE)
+        storage.upload(source_of(tmp_path, SMALL), URL)
     assert len(bucket.requests) == 1
 
 
@@ -110,7 +110,7 @@ def test_missing_bucket_raises_with_its_name(tmp_path: Path) -> None:
 
 @pytest.fixture(params=["gs", "memory", "folder"])
 def target(request: pytest.FixtureRequest, bucket: Gcs, tmp_path: Path) -> str:
-    """A target of each kind: an object store, an fsspec file system with folders, a local folder."""
+    """Return a target folder in an object store, in an fsspec file system with folders, or on this machine."""
     assert bucket.names("bucket") == ["before"]
     return {"gs": "gs://bucket/run", "memory": f"memory://{tmp_path.name}/run", "folder": str(tmp_path / "at/run")}[
         request.param
@@ -165,7 +165,7 @@ def test_readers_request_read_only_access(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(remote, "_filesystems", {})
     storage.file_sizes("gs://bucket/run")
     assert [system.credentials.access for system in remote._filesystems.values()] == ["read_only"]
-    storage.upload(source_of(tmp_path, SMALL), PLACE)
+    storage.upload(source_of(tmp_path, SMALL), URL)
     assert [system.credentials.access for system in remote._filesystems.values()] == ["read_only", "read_write"]
 
 
@@ -174,11 +174,11 @@ def test_file_removed_during_listing_is_omitted(tmp_path: Path, monkeypatch: pyt
         (tmp_path / name).write_bytes(b"1")
     is_file = Path.is_file
 
-    def vanishes(path: Path) -> bool:
-        was_there = is_file(path)
+    def remove_temporary_file(path: Path) -> bool:
+        existed = is_file(path)
         if path.name == "temporary":
             path.unlink()
-        return was_there
+        return existed
 
-    monkeypatch.setattr(Path, "is_file", vanishes)
+    monkeypatch.setattr(Path, "is_file", remove_temporary_file)
     assert storage.file_sizes(str(tmp_path)) == {"kept": 1}
