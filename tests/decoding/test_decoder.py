@@ -1,4 +1,4 @@
-"""The decoder survives save and load; an image depends on all latents of its own frame only."""
+"""The decoder: saving, loading, errors for unsuitable models, and properties of the network."""
 
 import json
 import re
@@ -28,30 +28,30 @@ def truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1])
 
 
-def test_decoder_survives_save_and_load_bit_exactly(whole_decoder: Path, tmp_path: Path) -> None:
-    one = load_decoder(whole_decoder)
-    save_decoder(tmp_path / "again", one.card, one.decoder.state_dict())
-    other = load_decoder(tmp_path / "again")
-    assert other.card == one.card
-    assert not one.decoder.training
-    assert not any(weight.requires_grad for weight in one.decoder.parameters())
+def test_saved_decoder_gives_bit_exact_images_after_loading(whole_decoder: Path, tmp_path: Path) -> None:
+    original = load_decoder(whole_decoder)
+    save_decoder(tmp_path / "copy", original.card, original.decoder.state_dict())
+    loaded = load_decoder(tmp_path / "copy")
+    assert loaded.card == original.card
+    assert not original.decoder.training
+    assert not any(weight.requires_grad for weight in original.decoder.parameters())
     latents = torch.randn(2, 4, 24, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(one.decoder.decode(latents), other.decoder.decode(latents))
-    assert sorted(path.name for path in (tmp_path / "again").iterdir()) == sorted([CARD, WEIGHTS])
+    assert torch.equal(original.decoder.decode(latents), loaded.decoder.decode(latents))
+    assert sorted(path.name for path in (tmp_path / "copy").iterdir()) == sorted([CARD, WEIGHTS])
 
 
 @pytest.mark.parametrize(
-    ("damage", "found"), [(Path.unlink, "No such file"), (truncate, "not a complete safetensors file")]
+    ("damage", "message"), [(Path.unlink, "No such file"), (truncate, "not a complete safetensors file")]
 )
-def test_damaged_weights_raise_with_their_name(folder: Path, damage: Callable[[Path], None], found: str) -> None:
+def test_damaged_weights_raise_with_the_file_name(folder: Path, damage: Callable[[Path], None], message: str) -> None:
     damage(folder / WEIGHTS)
-    with pytest.raises(InputError, match=found) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         load_decoder(folder)
     assert WEIGHTS in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("changes", "found"),
+    ("changes", "message"),
     [
         ({"format": "vjepa2-ac decoder 2"}, "format"),
         ({"more": 1}, "more: unknown"),
@@ -59,10 +59,10 @@ def test_damaged_weights_raise_with_their_name(folder: Path, damage: Callable[[P
         ({"shape": {"size": "tiny", "dim": 10**12, "grid": 2, "patch_size": 16}}, "shape.dim"),
     ],
 )
-def test_invalid_card_values_raise_with_their_names(folder: Path, changes: dict, found: str) -> None:
+def test_invalid_card_values_raise_with_their_names(folder: Path, changes: dict, message: str) -> None:
     values = json.loads((folder / CARD).read_text())
     (folder / CARD).write_text(json.dumps(values | changes))
-    with pytest.raises(InputError, match=re.escape(found)) as caught:
+    with pytest.raises(InputError, match=re.escape(message)) as caught:
         load_decoder(folder)
     assert str(folder / CARD) in str(caught.value)
     assert "train the decoder again" in str(caught.value)
@@ -81,33 +81,35 @@ def test_model_with_another_encoder_crop_or_size_raises(whole_decoder: Path, bas
     decoder, model = load_decoder(whole_decoder), WorldModel.from_pretrained(base_folder)
     data, square = DataConfig(path=decoder.card.data), DataConfig(path=decoder.card.data, crop="square")
     assert decoder.require_fit(model, data, subject="run") == ()
-    other = WorldModel.random(ModelSizes.model_validate(TINY), seed=4)
+    other_encoder = WorldModel.random(ModelSizes.model_validate(TINY), seed=4)
     with pytest.raises(InputError, match=r"does not fit the encoder and crop of run.*vjepa2-ac decoder CONFIG"):
-        decoder.require_fit(other, data, subject="run")
+        decoder.require_fit(other_encoder, data, subject="run")
     with pytest.raises(InputError, match=r"data\.crop released, the model's is square"):
         decoder.require_fit(model, square, subject="run")
     larger = WorldModel.random(ModelSizes.model_validate(TINY | {"image_size": 64}), seed=3)
-    same = replace(decoder, card=replace(decoder.card, encoder=larger.encoder_fingerprint()))  # the same weights
+    same_encoder = replace(decoder, card=replace(decoder.card, encoder=larger.encoder_fingerprint()))
     with pytest.raises(InputError, match="image size 32, the model's is 64"):
-        same.require_fit(larger, data, subject="run")
+        same_encoder.require_fit(larger, data, subject="run")
 
 
-def test_decoder_of_other_data_warns_with_both_data_sets(
+def test_decoder_trained_on_other_data_warns_with_both_data_sets(
     whole_decoder: Path, base_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     decoder, model = load_decoder(whole_decoder), WorldModel.from_pretrained(base_folder)
-    own, (real, simulated) = Path(decoder.card.data), (tmp_path / "real", tmp_path / "simulated")
+    training_data, real, simulated = Path(decoder.card.data), tmp_path / "real", tmp_path / "simulated"
     simulated.mkdir()
     (simulated / SIMULATION_FILE).write_text("{}")
-    ours = replace(decoder, name="builtin:sim-tiny")
-    fits = {(decoder, own): True, (decoder, real): False, (ours, real): False, (ours, simulated): True}
-    for (one, shown), is_own in fits.items():
-        said = one.require_fit(model, DataConfig(path=str(shown)), subject="run")
-        learned = SIMULATED if one is ours else str(own)
-        warning = f"The decoder {one.name} was trained on {learned}, not on {shown}: its images may be inaccurate."
-        assert said == (() if is_own else (warning,))
-    monkeypatch.chdir(own.parent)
-    assert decoder.require_fit(model, DataConfig(path=own.name), subject="run") == (), "the same folder"
+    builtin = replace(decoder, name="builtin:sim-tiny")
+    cases = {(decoder, training_data): True, (decoder, real): False, (builtin, real): False, (builtin, simulated): True}
+    for (trained, data), is_same_data in cases.items():
+        warnings = trained.require_fit(model, DataConfig(path=str(data)), subject="run")
+        trained_on = SIMULATED if trained is builtin else str(training_data)
+        warning = (
+            f"The decoder {trained.name} was trained on {trained_on}, not on {data}: its images may be inaccurate."
+        )
+        assert warnings == (() if is_same_data else (warning,))
+    monkeypatch.chdir(training_data.parent)
+    assert decoder.require_fit(model, DataConfig(path=training_data.name), subject="run") == (), "the same folder"
 
 
 # ---- the network ----
@@ -126,14 +128,14 @@ def random_latents(*batch: int, seed: int = 1) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_decoded_image_depends_on_its_own_frame_only(size: str) -> None:
+def test_decoded_image_depends_only_on_the_latents_of_its_frame(size: str) -> None:
     decoder, latents = make_decoder_of_size(size), random_latents(4)
     images = decoder.decode(latents)
-    other = latents.clone()
-    other[2] = random_latents(1, seed=2)[0]
-    changed = decoder.decode(other)
-    same = [torch.equal(one, two) for one, two in zip(images, changed, strict=True)]
-    assert same == [True, True, False, True]
+    changed_latents = latents.clone()
+    changed_latents[2] = random_latents(1, seed=2)[0]
+    changed_images = decoder.decode(changed_latents)
+    are_equal = [torch.equal(image, changed) for image, changed in zip(images, changed_images, strict=True)]
+    assert are_equal == [True, True, False, True]
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -153,21 +155,21 @@ def test_decoder_starts_equal_to_the_linear_decoder() -> None:
     assert torch.equal(decoder(latents), linear(latents))
     loss, _ = decoder_loss(decoder(latents), torch.rand(3, 3, 24, 24, generator=torch.Generator().manual_seed(4)))
     loss.backward()
-    last = decoder.further[-2].weight.grad
-    assert last.abs().max() > 0, "or it would remain the linear one"
+    gradient = decoder.further[-2].weight.grad
+    assert gradient.abs().max() > 0, "without a gradient the decoder would stay linear"
 
 
 def test_patch_depends_on_one_token_in_the_linear_decoder_and_on_all_in_others() -> None:
     latents = random_latents(1)
-    other = latents.clone()
-    other[0, 5] += 1.0  # second row, third column
+    changed_latents = latents.clone()
+    changed_latents[0, 5] += 1.0  # second row, third column
     for size in SIZES:
         decoder = make_decoder_of_size(size)
-        moved = (decoder(latents) != decoder(other))[0].any(dim=0)
-        inside = torch.zeros_like(moved)
-        inside[8:16, 16:24] = True
-        assert moved[inside].all()
-        assert bool(moved[~inside].any()) == (size != "linear")
+        has_changed = (decoder(latents) != decoder(changed_latents))[0].any(dim=0)
+        is_in_patch = torch.zeros_like(has_changed)
+        is_in_patch[8:16, 16:24] = True
+        assert has_changed[is_in_patch].all()
+        assert bool(has_changed[~is_in_patch].any()) == (size != "linear")
 
 
 def test_loss_of_equal_images_is_zero_and_each_term_detects_its_difference() -> None:

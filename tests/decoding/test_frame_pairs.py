@@ -26,19 +26,17 @@ def test_pairs_are_encoder_inputs_and_their_latents(
     config = make_config(data__crop=crop, data__cache_dtype="fp32")
     pairs = encode_split(config, frames=20)
     dataset, model = open_dataset(config.data), load_base(config.model, seed=config.seed)
-    numbers = [len(pairs) - 1, 0, 7]
-    read, place = pairs.read(numbers), 0
-    places = {}
-    for one in select_frames(dataset, "train", frames=20):
-        for step in one.steps.tolist():
-            places[place] = (one.episode, step)
-            place += 1
-    assert place == len(pairs)
-    for number, latents, image, name in zip(numbers, read.latents, read.images, read.episode_ids, strict=True):
-        episode, step = places[number]
+    indices = [len(pairs) - 1, 0, 7]
+    batch = pairs.read(indices)
+    selected = select_frames(dataset, "train", frames=20)
+    steps = [(entry.episode, step) for entry in selected for step in entry.steps.tolist()]
+    assert len(steps) == len(pairs)
+    for index, latents, image, name in zip(indices, batch.latents, batch.images, batch.episode_ids, strict=True):
+        episode, step = steps[index]
         assert name == dataset.table.identity(episode)
-        seen = crop_frames(dataset.source.read(episode, config.data.cameras[0]).read_frames([step]), config.data.crop)
-        inputs = pixels_to_input(torch.from_numpy(np.ascontiguousarray(seen))[None], 32)
+        frames = dataset.source.read(episode, config.data.cameras[0]).read_frames([step])
+        cropped = np.ascontiguousarray(crop_frames(frames, config.data.crop))
+        inputs = pixels_to_input(torch.from_numpy(cropped)[None], 32)
         assert torch.equal(image, input_to_pixels(inputs)[0, 0])
         with torch.no_grad():
             torch.testing.assert_close(latents, model.encode(inputs)[0, 0], atol=1e-5, rtol=0)
@@ -50,17 +48,17 @@ def test_selected_frames_are_spread_over_the_split_up_to_the_count(
 ) -> None:
     config = make_config(data__camera=["wrist_left", "exterior_1_left"])
     dataset = open_dataset(config.data)
-    members = dataset.split_mask(split)  # type: ignore[arg-type]
-    wanted = select_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
-    needed = {(one.episode, one.camera): set(one.steps.tolist()) for one in needed_frames(dataset)}
-    there = sum(len(steps) for (episode, _), steps in needed.items() if members[episode])
-    assert sum(len(one.steps) for one in wanted) == min(frames, there)
-    assert all(members[one.episode] for one in wanted)
-    assert all(set(one.steps.tolist()) <= needed[one.episode, one.camera] for one in wanted)
+    is_member = dataset.split_mask(split)  # type: ignore[arg-type]
+    selected = select_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
+    needed = {(entry.episode, entry.camera): set(entry.steps.tolist()) for entry in needed_frames(dataset)}
+    num_available = sum(len(steps) for (episode, _), steps in needed.items() if is_member[episode])
+    assert sum(len(entry.steps) for entry in selected) == min(frames, num_available)
+    assert all(is_member[entry.episode] for entry in selected)
+    assert all(set(entry.steps.tolist()) <= needed[entry.episode, entry.camera] for entry in selected)
     if frames >= 30:
-        assert {one.camera for one in wanted} == {"wrist_left", "exterior_1_left"}
-        assert {one.episode for one in wanted} == set(np.flatnonzero(members))
-        counts = [len(one.steps) for one in wanted]
+        assert {entry.camera for entry in selected} == {"wrist_left", "exterior_1_left"}
+        assert {entry.episode for entry in selected} == set(np.flatnonzero(is_member))
+        counts = [len(entry.steps) for entry in selected]
         assert max(counts) - min(counts) <= 1
 
 
@@ -68,15 +66,15 @@ def test_unencoded_episode_is_skipped_and_damaged_file_raises(
     make_config: MakeConfig, encode_split: EncodeSplit
 ) -> None:
     pairs = encode_split(make_config())
-    gone, damaged = (Path(pairs.files.path(one.episode, one.camera)) for one in pairs.frames[:2])
-    gone.unlink()
+    missing, damaged = (Path(pairs.files.path(entry.episode, entry.camera)) for entry in pairs.frames[:2])
+    missing.unlink()
     dataset = open_dataset(make_config().data)
-    rest = FramePairs.from_files(dataset, pairs.frames, pairs.files)
-    assert rest.episode_ids == pairs.episode_ids[1:]
-    assert len(rest) == len(pairs) - len(pairs.frames[0].steps)
+    remaining = FramePairs.from_files(dataset, pairs.frames, pairs.files)
+    assert remaining.episode_ids == pairs.episode_ids[1:]
+    assert len(remaining) == len(pairs) - len(pairs.frames[0].steps)
     damaged.write_bytes(damaged.read_bytes()[:-100])
     with pytest.raises(InputError, match=damaged.name):
-        rest.read(range(len(rest)))
+        remaining.read(range(len(remaining)))
 
 
 # ---- the linear decoder and the metrics ----
@@ -85,7 +83,7 @@ SHAPE = DecoderShape("tiny", dim=12, grid=2, patch_size=8)
 
 
 @dataclass
-class Linear:
+class LinearPairs:
     """Pairs whose images are linear functions of their latents, up to the rounding to 8 bits."""
 
     frames: int = 150
@@ -102,34 +100,34 @@ class Linear:
     def __len__(self) -> int:
         return self.frames
 
-    def read(self, numbers: list[int]) -> PairBatch:
-        return PairBatch(self.latents[list(numbers)], self.images[list(numbers)], ("",) * len(numbers))
+    def read(self, indices: list[int]) -> PairBatch:
+        return PairBatch(self.latents[list(indices)], self.images[list(indices)], ("",) * len(indices))
 
 
-def fit(pairs: Linear) -> Decoder:
+def fit(pairs: LinearPairs) -> Decoder:
     return fit_linear(pairs, SHAPE, torch.device("cpu"), no_progress)  # type: ignore[arg-type]
 
 
 def test_linear_fit_recovers_a_linear_decoder() -> None:
-    pairs = Linear()
-    found = fit(pairs)
-    torch.testing.assert_close(found.linear.weight, pairs.truth.linear.weight, atol=2e-3, rtol=0)
-    torch.testing.assert_close(found.linear.bias, pairs.truth.linear.bias, atol=2e-3, rtol=0)
-    new = torch.randn(5, 4, 12, generator=torch.Generator().manual_seed(9))
-    torch.testing.assert_close(found(new), pairs.truth(new).detach(), atol=2e-3, rtol=0)
-    assert not found.training
-    assert not any(one.requires_grad for one in found.parameters())
+    pairs = LinearPairs()
+    fitted = fit(pairs)
+    torch.testing.assert_close(fitted.linear.weight, pairs.truth.linear.weight, atol=2e-3, rtol=0)
+    torch.testing.assert_close(fitted.linear.bias, pairs.truth.linear.bias, atol=2e-3, rtol=0)
+    latents = torch.randn(5, 4, 12, generator=torch.Generator().manual_seed(9))
+    torch.testing.assert_close(fitted(latents), pairs.truth(latents).detach(), atol=2e-3, rtol=0)
+    assert not fitted.training
+    assert not any(parameter.requires_grad for parameter in fitted.parameters())
 
 
 def test_exact_frames_are_counted_and_excluded_from_psnr() -> None:
     """The PSNR of an exact frame is infinite, and JSON cannot represent an infinite mean over all frames."""
-    pairs, black = Linear(frames=9), torch.zeros(3, 16, 16)
+    pairs, black = LinearPairs(frames=9), torch.zeros(3, 16, 16)
     pairs.images[:2] = 0  # equal to the mean image
     pairs.images[2:] = 51
-    found = measure_decoders(pairs, {"decoder": pairs.truth}, black, no_progress)["mean_image"]  # type: ignore[arg-type]
-    assert found["exact_frames"] == 2
-    assert found["psnr_db"]["value"] == pytest.approx(13.979, abs=1e-3)  # -20 log10(51 / 255)
-    assert found["ssim"]["value"] is not None
+    metrics = measure_decoders(pairs, {"decoder": pairs.truth}, black, no_progress)["mean_image"]  # type: ignore[arg-type]
+    assert metrics["exact_frames"] == 2
+    assert metrics["psnr_db"]["value"] == pytest.approx(13.979, abs=1e-3)  # -20 log10(51 / 255)
+    assert metrics["ssim"]["value"] is not None
     pairs.images[:] = 0
-    found = measure_decoders(pairs, {"decoder": pairs.truth}, black, no_progress)["mean_image"]  # type: ignore[arg-type]
-    assert (found["exact_frames"], found["psnr_db"]["value"]) == (9, None)
+    metrics = measure_decoders(pairs, {"decoder": pairs.truth}, black, no_progress)["mean_image"]  # type: ignore[arg-type]
+    assert (metrics["exact_frames"], metrics["psnr_db"]["value"]) == (9, None)

@@ -1,4 +1,4 @@
-"""Decoder training learns to reconstruct frames and resumes exactly."""
+"""Decoder training: it learns to reconstruct frames, and resumes exactly."""
 
 import math
 import os
@@ -27,16 +27,14 @@ from vjepa2_ac.runs.metrics_log import read_metrics_log
 FINISHED = {CARD, WEIGHTS, "key.json", "metrics.jsonl", ".lock"}
 
 
-def assert_same_decoder(one: Path, other: Path) -> None:
-    first, second = load_file(one / WEIGHTS), load_file(other / WEIGHTS)
-    assert first.keys() == second.keys()
-    assert all(torch.equal(value, second[key]) for key, value in first.items())
-    assert read_card(one).held_out == read_card(other).held_out
-    rows = [list(read_metrics_log(folder / "metrics.jsonl")) for folder in (one, other)]
-    assert rows[0] == rows[1]
-    assert {
-        path.name for path in other.iterdir() if path.suffix != ".partial"
-    } == FINISHED  # partial files of the killed process
+def assert_same_decoder(folder: Path, expected: Path) -> None:
+    weights, expected_weights = load_file(folder / WEIGHTS), load_file(expected / WEIGHTS)
+    assert weights.keys() == expected_weights.keys()
+    assert all(torch.equal(value, expected_weights[key]) for key, value in weights.items())
+    assert read_card(folder).held_out == read_card(expected).held_out
+    assert list(read_metrics_log(folder / "metrics.jsonl")) == list(read_metrics_log(expected / "metrics.jsonl"))
+    # A killed process may leave partial files.
+    assert {path.name for path in folder.iterdir() if path.suffix != ".partial"} == FINISHED
 
 
 # ---- learning ------------------------------------------------------------------------------------------------------
@@ -56,21 +54,21 @@ def test_decoder_memorises_four_frames(make_decoder: MakeConfig, encode_split: E
 def test_stopped_training_resumes_exactly(
     make_decoder: MakeConfig, whole_decoder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    learn = DecoderSteps.run
+    original_run = DecoderSteps.run
 
-    def step(self: object, number: int, pairs: PairBatch) -> dict:
-        if number == 3:
+    def run_with_signal(self: object, step: int, pairs: PairBatch) -> dict:
+        if step == 3:
             os.kill(os.getpid(), signal.SIGTERM)
-        return learn(self, number, pairs)  # type: ignore[arg-type]
+        return original_run(self, step, pairs)  # type: ignore[arg-type]
 
     config = make_decoder()
     with monkeypatch.context() as patch:
-        patch.setattr(DecoderSteps, "run", step)
+        patch.setattr(DecoderSteps, "run", run_with_signal)
         with pytest.raises(StoppedError, match="stopped after step 3"):
             train_decoder(config)
     assert not (tmp_path / "decoder" / CARD).exists()
     train_decoder(config)
-    assert_same_decoder(whole_decoder, tmp_path / "decoder")
+    assert_same_decoder(tmp_path / "decoder", whole_decoder)
 
 
 def test_killed_training_resumes_exactly(
@@ -78,14 +76,14 @@ def test_killed_training_resumes_exactly(
 ) -> None:
     (tmp_path / "config.yaml").write_text(as_yaml(make_decoder()))
     out = tmp_path / "decoder"
-    start = ("decoder", str(tmp_path / "config.yaml"))
-    for died_at in (12, 35):  # while frames are encoded, and between checkpoints
-        assert nursery.start(*start, folder=str(out), die_at=died_at).wait() == KILLED  # type: ignore[arg-type]
-    assert nursery.start(*start, folder=str(out)).wait() == 0  # type: ignore[arg-type]
-    assert_same_decoder(whole_decoder, out)
+    command = ("decoder", str(tmp_path / "config.yaml"))
+    for die_at in (12, 35):  # while frames are encoded, and between checkpoints
+        assert nursery.start(*command, folder=str(out), die_at=die_at).wait() == KILLED  # type: ignore[arg-type]
+    assert nursery.start(*command, folder=str(out)).wait() == 0  # type: ignore[arg-type]
+    assert_same_decoder(out, whole_decoder)
 
 
-def test_leftovers_in_a_finished_folder_are_removed_and_check_writes_nothing(
+def test_temporary_files_of_a_finished_training_are_removed_but_not_by_check(
     make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, reporter: SilentReporter
 ) -> None:
     shutil.copytree(whole_decoder, tmp_path / "decoder")
@@ -104,7 +102,7 @@ def test_leftovers_in_a_finished_folder_are_removed_and_check_writes_nothing(
 
 
 @pytest.mark.parametrize(
-    ("changes", "name"),
+    ("changes", "message"),
     [
         ({"knobs": {"learning_rate": 1e-3}}, r"decoder\.learning_rate: 0\.002, not 0\.001"),
         ({"seed": 1}, "seed: 0, not 1"),
@@ -113,26 +111,27 @@ def test_leftovers_in_a_finished_folder_are_removed_and_check_writes_nothing(
     ],
 )
 def test_folder_of_another_decoder_raises_with_the_difference(
-    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, changes: dict, name: str
+    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, changes: dict, message: str
 ) -> None:
     shutil.copytree(whole_decoder, tmp_path / "decoder")
-    for _ in ("finished", "begun"):
-        with pytest.raises(InputError, match=name):
+    for is_finished in (True, False):
+        if not is_finished:
+            (tmp_path / "decoder" / CARD).unlink()
+        with pytest.raises(InputError, match=message):
             train_decoder(make_decoder(**changes))
-        (tmp_path / "decoder" / CARD).unlink(missing_ok=True)
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changes", "message"),
     [
         ({"data__source": "latents"}, r"data\.source: a latent cache, which has no frames"),
         ({"data__stride": "auto"}, r"data\.stride"),
     ],
 )
-def test_undecodable_config_raises_before_the_data_is_opened(
-    make_decoder: MakeConfig, tmp_path: Path, changes: dict, words: str
+def test_config_without_frames_or_stride_raises_before_the_data_is_opened(
+    make_decoder: MakeConfig, tmp_path: Path, changes: dict, message: str
 ) -> None:
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=message):
         train_decoder(make_decoder(data__path=str(tmp_path / "nowhere"), **changes))
     assert not (tmp_path / "decoder").exists()
 
@@ -147,10 +146,10 @@ def test_model_with_unsupported_image_or_patch_size_raises(
 
 
 def test_diverging_learning_rate_raises_with_its_key(make_decoder: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    def exploded(images: torch.Tensor, targets: torch.Tensor) -> tuple[torch.Tensor, dict]:
+    def infinite_loss(images: torch.Tensor, targets: torch.Tensor) -> tuple[torch.Tensor, dict]:
         return (images - targets).sum() * math.inf, {}
 
-    monkeypatch.setattr(training, "decoder_loss", exploded)
+    monkeypatch.setattr(training, "decoder_loss", infinite_loss)
     with pytest.raises(InputError, match=r"decoder\.learning_rate: .*not finite"):
         train_decoder(make_decoder())
 
@@ -158,17 +157,17 @@ def test_diverging_learning_rate_raises_with_its_key(make_decoder: MakeConfig, m
 # ---- schedule ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("steps", "peak"), [(150, 10), (10, 0), (20_000, 500)])
-def test_learning_rate_warms_up_and_decays_to_zero(steps: int, peak: int) -> None:
+@pytest.mark.parametrize(("steps", "warmup"), [(150, 10), (10, 0), (20_000, 500)])
+def test_learning_rate_warms_up_and_decays_to_zero(steps: int, warmup: int) -> None:
     config = DecoderConfig(steps=steps, learning_rate=0.5)
     rates = [learning_rate_at(step, config) for step in range(1, steps + 1)]
-    assert rates[:peak] == pytest.approx([0.5 * (step + 1) / peak for step in range(peak)])
-    assert rates[peak:] == sorted(rates[peak:], reverse=True)
+    assert rates[:warmup] == pytest.approx([0.5 * (step + 1) / warmup for step in range(warmup)])
+    assert rates[warmup:] == sorted(rates[warmup:], reverse=True)
     assert rates[-1] == pytest.approx(0.0, abs=1e-12)
     assert max(rates) <= 0.5
 
 
-def test_settings_without_effect_keep_the_decoder(
+def test_finished_decoder_is_kept_if_settings_without_effect_change(
     make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, reporter: SilentReporter
 ) -> None:
     shutil.copytree(whole_decoder, tmp_path / "decoder")

@@ -1,7 +1,7 @@
 """The decoder, which turns the latents of a frame into an image, and its folder of files (no code is executed).
 
-A decoder is trained on the latents of true frames only, without an adversarial loss, and applied to predictions without
-changes. If a prediction averages several possible futures, the image is blurred. A decoder fits one encoder only:
+A decoder is trained only on the latents of true frames, without an adversarial loss, and applied to predictions without
+changes. If a prediction averages several possible futures, the image is blurred. A decoder fits only one encoder:
 latents of another encoder would give meaningless images and are rejected.
 
 Source of the idea: Assran et al. (2025), V-JEPA 2, appendix B.3; sizes and losses differ.
@@ -44,7 +44,7 @@ Size = Literal["linear", "tiny", "small", "medium"]
 _MIDDLE, _RANGE = 0.5, 0.25  # pixel = output x range + middle; the network's outputs are about -2 .. 2
 _FREQUENCIES = 10_000.0
 _STD = 0.02
-UPSAMPLED = 4  # factor of upsampling before the last layer: the resolution is doubled twice
+UPSAMPLED = 4  # upsampling factor of the convolutions before the last one: the resolution is doubled twice
 _LAST = -2  # index of the last layer with weights in `Decoder.further`
 
 
@@ -53,7 +53,7 @@ class DecoderShape:
     """The size of a decoder, and the sizes of its encoder's latents."""
 
     size: Size
-    dim: Annotated[int, Field(ge=1, le=1 << 14)]  # dimension of a token
+    dim: Annotated[int, Field(ge=1, le=1 << 14)]  # number of values of a token
     grid: Annotated[int, Field(ge=1, le=256)]  # tokens along each side of a frame
     patch_size: Annotated[int, Field(ge=UPSAMPLED, le=64, multiple_of=UPSAMPLED)]  # pixels
 
@@ -63,7 +63,7 @@ class DecoderShape:
         return self.grid * self.patch_size
 
 
-# Blocks, their width and heads, and the channels after the first and the second doubling of the resolution.
+# Number of blocks, their width and attention heads, and the channels after each of the two doublings of the resolution.
 _SIZES = {"tiny": (2, 128, 4, 64, 32), "small": (6, 512, 8, 256, 128), "medium": (12, 768, 12, 256, 128)}
 
 
@@ -95,7 +95,7 @@ class Decoder(nn.Module):
 
     @torch.no_grad()
     def copy_linear(self, linear: Decoder) -> None:
-        """Copy the matrix of a linear decoder, and zero the last further layer, so that both outputs are equal."""
+        """Make the output equal to a linear decoder's: copy its matrix and zero the last layer of the second branch."""
         self.linear.load_state_dict(linear.linear.state_dict())
         if self.further is not None:
             for parameter in self.further[_LAST].parameters():
@@ -115,20 +115,20 @@ class Decoder(nn.Module):
             actual = "x".join(map(str, latents.shape[-2:]))
             raise ValueError(f"latents of shape {actual}; this decoder expects {shape.grid**2}x{shape.dim}")
         frames = latents.reshape(-1, *latents.shape[-2:])
-        numbers: Tensor = self.unfold(self.linear(frames))
+        outputs: Tensor = self.unfold(self.linear(frames))
         if self.further is not None:
-            numbers = numbers + self.further(frames)
-        images = numbers.float() * _RANGE + _MIDDLE
+            outputs = outputs + self.further(frames)
+        images = outputs.float() * _RANGE + _MIDDLE
         return images.reshape(*latents.shape[:-2], *images.shape[-3:])
 
     @staticmethod
     def to_outputs(images: Images) -> Images:
-        """Return the outputs of the network that correspond to images."""
+        """Return the outputs of the network for which `forward` returns these images."""
         return (images - _MIDDLE) / _RANGE
 
     @torch.no_grad()
     def decode(self, latents: Latents, *, chunk: int = 64) -> Images:
-        """Return images in float32, clipped to 0 .. 1; `chunk` frames at a time bound the memory."""
+        """Return images in float32, clipped to 0 .. 1; `chunk` frames are decoded at a time, to limit the memory."""
         frames = latents.reshape(-1, *latents.shape[-2:])
         images: Tensor = torch.cat([self(part).clamp(0.0, 1.0) for part in torch.split(frames, chunk)])
         return images.reshape(*latents.shape[:-2], *images.shape[-3:])
@@ -155,7 +155,7 @@ def _make_convolutions(shape: DecoderShape) -> nn.Sequential:
 
 
 class _Positions(nn.Module):
-    """Position encoding: adds sines and cosines of each token's row (first half) and column (second half)."""
+    """Position encoding: adds sines and cosines of a token's row (first half of the width) and column (second half)."""
 
     table: Tensor
 
@@ -191,7 +191,7 @@ class _Block(nn.Module):
 
 
 def to_images(pixels: UInt8[Tensor, "*batch 3 size size"]) -> Images:
-    """Convert 8-bit images to the decoder's range: black 0, white 1."""
+    """Convert 8-bit images to the decoder's range, black 0 to white 1."""
     return pixels.float() / 255.0
 
 
@@ -211,7 +211,7 @@ _FIX = "Copy the folder again, or train the decoder again with `vjepa2-ac decode
 
 @dataclass(frozen=True)
 class DecoderCard:
-    """Description of a decoder: its shape, its encoder, and how it was trained."""
+    """The content of decoder.json: the decoder's shape, its encoder, and how it was trained."""
 
     format: Literal["vjepa2-ac decoder 1"]
     shape: DecoderShape
@@ -222,7 +222,7 @@ class DecoderCard:
     cameras: tuple[str, ...]
     episodes: int  # number of training episodes
     frames: int  # number of training frames
-    steps: int
+    steps: int  # number of optimizer steps
     held_out: Mapping[str, Any] = field(default_factory=dict)  # result of `frame_pairs.measure_decoders`
     version: str = __version__
     time: str = ""  # UTC
@@ -234,8 +234,8 @@ class TrainedDecoder:
 
     card: DecoderCard
     decoder: Decoder
-    name: str  # folder or builtin: name, as given by the user
-    where: str = "--decoder"  # the option or config key that names it
+    name: str  # folder or "builtin:..." name, as the user set it
+    where: str = "--decoder"  # the option or config key that contains the name
 
     def to(self, device: torch.device) -> TrainedDecoder:
         """Move the decoder to a device."""
@@ -286,7 +286,7 @@ class TrainedDecoder:
 
 
 def _is_same_data(first_path: str, second_path: str) -> bool:
-    """Return whether two values of `data.path` are the same data set, or are both of the simulated arm."""
+    """Return whether two values of `data.path` are the same data set, or are both data sets of the simulated arm."""
     are_simulated = (path == SIMULATED or Path(path, SIMULATION_FILE).is_file() for path in (first_path, second_path))
     return Path(first_path).resolve() == Path(second_path).resolve() or all(are_simulated)
 
@@ -307,10 +307,10 @@ def load_decoder(name: str | Path, *, where: str = "--decoder") -> TrainedDecode
 
     Args:
         name: The folder of the decoder; or builtin:sim-tiny for the built-in decoder.
-        where: The option or config key that names it, for messages.
+        where: The option or config key that contains the name, for messages.
 
     Raises:
-        InputError: There is no decoder, or it is incomplete or damaged.
+        InputError: There is no decoder with this name, or it is incomplete or damaged.
     """
     is_builtin = str(name).startswith(BUILTIN)
     folder = ASSETS / str(name).removeprefix(BUILTIN) / BUILTIN_DECODER if is_builtin else Path(name)
@@ -321,7 +321,7 @@ def load_decoder(name: str | Path, *, where: str = "--decoder") -> TrainedDecode
 
 
 def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
-    """Read the description of a decoder.
+    """Read decoder.json in the folder of a decoder.
 
     Raises:
         InputError: The folder contains no decoder, or decoder.json is damaged.

@@ -1,6 +1,6 @@
 """The training data of a decoder (pairs of frame and latents), the linear and mean-image baselines, and metrics.
 
-The frames, with the crop and size of the encoder's input, and their latents are stored in files of a latent cache.
+Frames and latents are stored in files of a latent cache. The frames have the crop and size of the encoder's input.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ class FramePairs:
     """Pairs of frame and latents in files, read by index."""
 
     files: LatentFiles
-    frames: tuple[FramesToEncode, ...]  # frames of each file, at least one
+    frames: tuple[FramesToEncode, ...]  # frames of each file, at least one per file
     episode_ids: tuple[str, ...]  # episode of each file
 
     @classmethod
     def from_files(cls, dataset: Dataset, selected: Sequence[FramesToEncode], files: LatentFiles) -> FramePairs:
-        """Return the selected frames that could be encoded."""
+        """Return pairs for those selected frames whose file exists."""
         encoded = tuple(frames for frames in selected if files.has_file(frames.episode, frames.camera))
         return cls(files, encoded, tuple(dataset.table.identity(frames.episode) for frames in encoded))
 
@@ -59,7 +59,7 @@ class FramePairs:
         return int(self._ends[-1]) if self.frames else 0
 
     def read(self, indices: Sequence[int]) -> PairBatch:
-        """Read pairs by their indices, in this order.
+        """Read the pairs with these indices, in this order.
 
         Raises:
             InputError: A file is missing or damaged.
@@ -79,12 +79,12 @@ class FramePairs:
 
 
 def select_frames(dataset: Dataset, split: Split, *, frames: int) -> list[FramesToEncode]:
-    """Return at most about this many frames of a split, spread over its episodes and cameras.
+    """Select up to `frames` frames of a split, spread evenly over its episodes and cameras.
 
     Only frames that clips use are selected. The list is empty if the split has no clips.
     """
-    members = dataset.split_mask(split)
-    candidates = [entry for entry in needed_frames(dataset) if members[entry.episode]]
+    is_member = dataset.split_mask(split)
+    candidates = [entry for entry in needed_frames(dataset) if is_member[entry.episode]]
     total = sum(len(entry.steps) for entry in candidates)
     positions, first = np.linspace(0, total, min(frames, total), endpoint=False).astype(int), 0
     selected = []
@@ -97,7 +97,7 @@ def select_frames(dataset: Dataset, split: Split, *, frames: int) -> list[Frames
     return selected
 
 
-_FRAMES = 4_000  # largest number of frames for the linear fit; enough for a matrix of 1,408 x 768 numbers
+_FIT_FRAMES = 4_000  # maximum number of frames for the linear fit; enough for a matrix of 1,408 x 768 numbers
 _MEAN_IMAGE_FRAMES = 1_000
 _FIT_BATCH_SIZE, _MEASURE_BATCH_SIZE = 64, 32
 _RIDGE = 1e-4  # ridge, relative to the mean second moment of the latents' components
@@ -105,9 +105,9 @@ _RIDGE = 1e-4  # ridge, relative to the mean second moment of the latents' compo
 
 @torch.no_grad()
 def fit_linear(pairs: FramePairs, shape: DecoderShape, device: torch.device, progress: Progress) -> Decoder:
-    """Fit the linear decoder by least squares with a small ridge.
+    """Fit the linear decoder by least squares with a small ridge penalty.
 
-    It is a linear probe: everything that it reconstructs is linearly decodable from single tokens.
+    The fit is a linear probe: everything that the decoder reconstructs is linearly decodable from single tokens.
 
     Args:
         pairs: Frames and their latents.
@@ -116,34 +116,35 @@ def fit_linear(pairs: FramePairs, shape: DecoderShape, device: torch.device, pro
         progress: Called with (done, total) in frames.
     """
     decoder = Decoder(DecoderShape("linear", shape.dim, shape.grid, shape.patch_size))
-    indices = spread_indices(len(pairs), _FRAMES)
-    inner: Float[Tensor, "dim+1 dim+1"] = torch.zeros(shape.dim + 1, shape.dim + 1, dtype=torch.float64)
-    outer: Float[Tensor, "dim+1 pixels"] = torch.zeros(shape.dim + 1, 3 * shape.patch_size**2, dtype=torch.float64)
-    done = 0
-    for batch in _read_parts(pairs, indices, _FIT_BATCH_SIZE):
+    indices = spread_indices(len(pairs), _FIT_FRAMES)
+    # The normal equations: moments @ solution = products.
+    moments: Float[Tensor, "dim+1 dim+1"] = torch.zeros(shape.dim + 1, shape.dim + 1, dtype=torch.float64)
+    products: Float[Tensor, "dim+1 pixels"] = torch.zeros(shape.dim + 1, 3 * shape.patch_size**2, dtype=torch.float64)
+    num_read = 0
+    for batch in _read_batches(pairs, indices, _FIT_BATCH_SIZE):
         tokens = batch.latents.to(device).flatten(0, 1)
         tokens = torch.cat([tokens, torch.ones_like(tokens[:, :1])], dim=1)
         outputs = decoder.to_outputs(to_images(batch.images.to(device)))
         patches = rearrange(
             outputs, "n c (rows p) (columns q) -> (n rows columns) (c p q)", p=shape.patch_size, q=shape.patch_size
         )
-        inner += (tokens.T @ tokens).cpu()
-        outer += (tokens.T @ patches).cpu()
-        done += len(batch.episode_ids)
-        progress(done, len(indices))
-    ridge = _RIDGE * inner.diagonal()[:-1].mean()
-    inner.diagonal()[:-1] += ridge
-    solved = torch.linalg.solve(inner, outer).float()
-    weight, bias = solved[:-1].T.contiguous(), solved[-1].contiguous()
+        moments += (tokens.T @ tokens).cpu()
+        products += (tokens.T @ patches).cpu()
+        num_read += len(batch.episode_ids)
+        progress(num_read, len(indices))
+    ridge = _RIDGE * moments.diagonal()[:-1].mean()
+    moments.diagonal()[:-1] += ridge
+    solution = torch.linalg.solve(moments, products).float()
+    weight, bias = solution[:-1].T.contiguous(), solution[-1].contiguous()
     decoder.linear.load_state_dict({"weight": weight, "bias": bias})
     return decoder.eval().requires_grad_(False)
 
 
 @torch.no_grad()
 def compute_mean_image(pairs: FramePairs) -> Float[Tensor, "3 size size"]:
-    """Return the mean of some images, spread over the pairs: the output of a decoder that ignores its input."""
+    """Return the mean of up to 1,000 frames, a baseline that ignores the latents."""
     indices = spread_indices(len(pairs), _MEAN_IMAGE_FRAMES)
-    total = sum(to_images(batch.images).sum(dim=0) for batch in _read_parts(pairs, indices, _MEASURE_BATCH_SIZE))
+    total = sum(to_images(batch.images).sum(dim=0) for batch in _read_batches(pairs, indices, _MEASURE_BATCH_SIZE))
     return torch.as_tensor(total / len(indices))
 
 
@@ -161,30 +162,30 @@ def measure_decoders(
         mean: Mean image of the training frames.
         progress: Called with (done, total) in frames.
     """
-    measured: dict[str, list[np.ndarray]] = defaultdict(list)
+    metrics_by_name: dict[str, list[np.ndarray]] = defaultdict(list)
     ids: list[str] = []
     device = next(next(iter(decoders.values())).parameters()).device
-    for batch in _read_parts(pairs, range(len(pairs)), _MEASURE_BATCH_SIZE):
+    for batch in _read_batches(pairs, range(len(pairs)), _MEASURE_BATCH_SIZE):
         latents, true = batch.latents.to(device), to_images(batch.images.to(device))
         decoded = {name: decoder.decode(latents) for name, decoder in decoders.items()}
         decoded["mean_image"] = mean.to(device).expand_as(true)
         for name, images in decoded.items():
-            measured[name].append(torch.stack([psnr(images, true), ssim(images, true)]).double().cpu().numpy())
+            metrics_by_name[name].append(torch.stack([psnr(images, true), ssim(images, true)]).double().cpu().numpy())
         ids += batch.episode_ids
         progress(len(ids), len(pairs))
     means: dict[str, Any] = {"frames": len(ids), "episodes": len(set(ids))}
-    for name, parts in measured.items():
-        decibels, similar = np.concatenate(parts, axis=1)
-        finite = np.isfinite(decibels)
+    for name, batches in metrics_by_name.items():
+        psnr_db, similarity = np.concatenate(batches, axis=1)
+        is_finite = np.isfinite(psnr_db)
         means[name] = {
-            "psnr_db": estimate_mean(decibels[finite], np.array(ids)[finite].tolist()).as_dict(),
-            "ssim": estimate_mean(similar, ids).as_dict(),
-            "exact_frames": int((~finite).sum()),
+            "psnr_db": estimate_mean(psnr_db[is_finite], np.array(ids)[is_finite].tolist()).as_dict(),
+            "ssim": estimate_mean(similarity, ids).as_dict(),
+            "exact_frames": int((~is_finite).sum()),
         }
     return means
 
 
-def _read_parts(pairs: FramePairs, indices: Sequence[int], size: int) -> Iterator[PairBatch]:
-    """Yield pairs in parts of at most `size`."""
+def _read_batches(pairs: FramePairs, indices: Sequence[int], size: int) -> Iterator[PairBatch]:
+    """Yield batches of at most `size` pairs."""
     for first in range(0, len(indices), size):
         yield pairs.read(indices[first : first + size])

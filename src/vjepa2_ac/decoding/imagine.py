@@ -1,7 +1,7 @@
-"""Decoded rollouts from one frame with any actions, as image strip, video and GIF; and the image strip of a validation.
+"""Decoded rollouts from one frame with any actions, as image strip, video and GIF; and image strips during training.
 
-Only the first frame and its state are given. The later states are integrated from the first one, because recorded
-states would reveal the motion to the model.
+The inputs are the first frame, its state and the actions. With alternative actions the later states are integrated
+from the first state, because the recorded states belong to the recorded actions.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ _GROUND_TRUTH, _TITLE = "ground truth", "Frames predicted from one input frame a
 _MUCH_WORSE_DB = 5.0
 _RATE_HZ = 15.0  # frame rate of the video
 _MAX_NAME_LENGTH = 44  # characters
-_MIN_SHOWN_CM, _MIN_SHOWN_GRIPPER = 0.15, 0.05  # smaller components of an action are left out of captions
+_MIN_SHOWN_CM, _MIN_SHOWN_GRIPPER = 0.15, 0.05  # captions omit smaller components of an action
 _POSE = 7  # width of a pose
 _DIRECTIONS = (("forward", "back"), ("left", "right"), ("up", "down"))  # names of +/- x, y, z in the robot base frame
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """The start of a rollout: the input of a model before the first action."""
+    """The start of a rollout: the model's input for the first frame."""
 
     latents: Float[Tensor, "tokens dim"]
     state: Float[np.ndarray, " state_dim"]
@@ -71,12 +71,12 @@ class Start:
 class DecodedRollout:
     """A decoded rollout, and the true frames if they are known."""
 
-    model: str  # base, adapter, model
-    name: str  # name of the actions: as recorded, up, ...
+    model: str  # such as "base", "adapter" or "model"
+    name: str  # name of the actions, such as "as recorded" or "up"
     actions: Actions
     frames: Frames  # predicted frame after each action
     truth: Frames | None = None
-    outlines: Bool[np.ndarray, "time size size"] | None = None  # true silhouette of the arm, start included
+    outlines: Bool[np.ndarray, "time size size"] | None = None  # true mask of the arm, including the start frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class RolloutComparison:
 
     subject: str
     episode_id: str  # "" for an image that is not from a data set
-    start: int  # control step
+    start: int  # control step of the first frame
     seconds_per_step: float
     first: Image
     decoded_first: Image
@@ -105,11 +105,11 @@ def compute_rollout(
     """Return the predicted latents after each action, in a rollout from one frame.
 
     Args:
-        rollout: The predictor, such as `WorldModel.rollout`.
+        rollout: The prediction function, such as `WorldModel.rollout`.
         start: The first frame and its state.
         actions: One action for each step.
-        states: The recorded states, for recorded actions. None: states are integrated from the first one, and gripper
-            commands are clipped to the possible range (`clip_gripper_changes`), as in the training data.
+        states: The recorded states, for recorded actions. None: states are integrated from the first state, and gripper
+            changes are clipped to the possible range (`clip_gripper_changes`), as in the training data.
     """
     if states is None:
         states = integrate_states(start.state, actions, start.space)[:-1]
@@ -123,15 +123,15 @@ def compute_rollout(
 
 
 def describe_poor_reconstruction(card: DecoderCard, first: Image, decoded_first: Image) -> tuple[str, ...]:
-    """Return a note if the decoder reconstructs the start much worse than its own held-out frames."""
-    usual = card.held_out.get("decoder", {}).get("psnr_db", {}).get("value")
+    """Return a note if the decoder reconstructs the start frame much worse than the decoder's held-out frames."""
+    usual_db = card.held_out.get("decoder", {}).get("psnr_db", {}).get("value")
     error = np.square(first.astype(np.float64) - decoded_first).mean() / 255**2
-    decibels = -10 * np.log10(max(error, 1e-10))
-    if usual is None or decibels > usual - _MUCH_WORSE_DB:
+    psnr_db = -10 * np.log10(max(error, 1e-10))
+    if usual_db is None or psnr_db > usual_db - _MUCH_WORSE_DB:
         return ()
     note = (
-        f"The decoder reconstructs the start frame with a PSNR of {decibels:.1f} dB, compared with {usual:.1f} dB on"
-        f" its held-out frames. Details that the images lack may be in the latents. Train a decoder on this scene."
+        f"The decoder reconstructs the start frame with a PSNR of {psnr_db:.1f} dB, compared with {usual_db:.1f} dB on"
+        f" its held-out frames. The latents may contain details that the images lack. Train a decoder on this scene."
     )
     return (note,)
 
@@ -139,29 +139,29 @@ def describe_poor_reconstruction(card: DecoderCard, first: Image, decoded_first:
 def decode_views(
     decoder: Decoder, latents: Float[Tensor, "steps tokens dim"], views: int = 1
 ) -> UInt8[np.ndarray, "steps size all 3"]:
-    """Decode latents to 8-bit images; several views, whose tokens are concatenated, are put side by side."""
+    """Decode latents to 8-bit images. With several views, tokens are concatenated and images are put side by side."""
     images = to_pixels(decoder.decode(latents.float().reshape(len(latents) * views, -1, latents.shape[-1])))
     return np.concatenate([images[number::views] for number in range(views)], axis=2)
 
 
 def make_strip(comparison: RolloutComparison) -> RolloutStrip:
-    """Return the image strip of a comparison: for each action sequence the true frames, then those of each model.
+    """Return the image strip of a comparison: for each action sequence the true frames, then the frames of each model.
 
-    The recorded action sequence comes first.
+    The recorded action sequence is first.
     """
     first, decoded_first = comparison.first[None], comparison.decoded_first[None]
     rows: list[StripRow] = []
     ordered = sorted(comparison.rollouts, key=lambda rollout: rollout.name != AS_RECORDED)
     for name, rollouts in groupby(ordered, key=lambda rollout: rollout.name):
         for number, rollout in enumerate(rollouts):
-            sequence, recorded = _describe_actions(rollout), name == AS_RECORDED
-            if not number and (truth := comparison.truth if recorded else rollout.truth) is not None:
-                captions = ("", *map(_describe_action, rollout.actions)) if recorded else ()
+            sequence, is_recorded = _describe_actions(rollout), name == AS_RECORDED
+            if not number and (truth := comparison.truth if is_recorded else rollout.truth) is not None:
+                captions = ("", *map(_describe_action, rollout.actions)) if is_recorded else ()
                 frames = np.concatenate([first, truth])
                 rows.append(
-                    StripRow(_GROUND_TRUTH, "recorded" if recorded else "simulated", frames, captions, sequence)
+                    StripRow(_GROUND_TRUTH, "recorded" if is_recorded else "simulated", frames, captions, sequence)
                 )
-            if not number and recorded and comparison.decoded_truth is not None:
+            if not number and is_recorded and comparison.decoded_truth is not None:
                 frames = np.concatenate([decoded_first, comparison.decoded_truth])
                 rows.append(StripRow("ground truth,\ndecoded", "decoded", frames, sequence=sequence))
             frames = np.concatenate([decoded_first, rollout.frames])
@@ -187,27 +187,28 @@ def _describe_actions(rollout: DecodedRollout) -> str:
 
 
 def _describe_action(action: Float[np.ndarray, " action_dim"]) -> str:
-    """Return a short description of a pose action in the robot's directions; empty for a vector."""
+    """Return a description of an action of poses, such as "left 2.0, up 1.0 cm, close"; empty for vectors."""
     if len(action) != _POSE:
         return ""
     components = []
     for amount, (plus, minus) in zip(100 * action[:3], _DIRECTIONS, strict=True):
         if abs(amount) >= _MIN_SHOWN_CM:
             components.append((abs(amount), f"{plus if amount > 0 else minus} {abs(amount):.1f}"))
-    parts = [text for _, text in sorted(components, reverse=True)[:2]]
+    largest = [text for _, text in sorted(components, reverse=True)[:2]]
+    parts = [f"{', '.join(largest)} cm"] if largest else []
     if abs(action[6]) >= _MIN_SHOWN_GRIPPER:
         parts.append("close" if action[6] > 0 else "open")
-    return ", ".join(parts) + (" cm" if components else "") if parts else "still"
+    return ", ".join(parts) or "still"
 
 
 def _shorten_name(name: str) -> str:
-    """Return the end of an episode's name; DROID's identities name several files, of which the first one is used."""
+    """Return the end of an episode's name; for DROID, whose names contain several paths, the end of the first path."""
     short = name.split("--", maxsplit=1)[0].removesuffix("/recordings/MP4").rstrip("/")
     return short if len(short) <= _MAX_NAME_LENGTH else f"...{short[-_MAX_NAME_LENGTH:]}"
 
 
 def write_rollouts(comparison: RolloutComparison, folder: Path, *, reporter: Reporter = SILENT) -> list[Path]:
-    """Write image strip, video and GIF; return their paths. Without PyAV the video is left out, with a note.
+    """Write image strip, video and GIF, and return their paths; without PyAV a note replaces the video.
 
     Raises:
         InputError: The folder cannot be written.
@@ -230,8 +231,8 @@ def write_rollouts(comparison: RolloutComparison, folder: Path, *, reporter: Rep
 class ValidationStrip:
     """A training hook that draws an image strip at each validation: true frames, and predictions of base and model.
 
-    The clip is always the validation clip with the most motion (with several processes: of rank 0's clips). An error
-    here does not end the run: the strip is left out with a warning.
+    The clip is always the one with the most motion among the validation clips (of rank 0). An error while drawing does
+    not end the run: it is logged as a warning, and there is no strip.
 
     Args:
         config: Config of the run, with `validation.decoder`.
@@ -242,9 +243,9 @@ class ValidationStrip:
 
     def __init__(self, config: Config) -> None:
         self._decoder: TrainedDecoder = load_decoder(str(config.validation.decoder), where="validation.decoder:")
-        self._max_motion = -1.0  # motion of the selected clip
-        self._clip: tuple[Batch, int, LatentBatch] | None = None  # its batch, its row in it, and its latents and states
-        self._frames: UInt8[np.ndarray, "time size size 3"] | None = None  # its true frames, read once
+        self._max_motion = -1.0  # path length of the selected clip
+        self._clip: tuple[Batch, int, LatentBatch] | None = None  # the batch of the clip, its row, and its latents
+        self._frames: UInt8[np.ndarray, "time size size 3"] | None = None  # the clip's true frames, read once
 
     def require_fit(self, world_model: WorldModel, config: Config) -> None:
         """Refuse a decoder for another encoder or crop.
@@ -255,17 +256,18 @@ class ValidationStrip:
         self._decoder.require_fit(world_model, config.data, subject=config.model.base)
 
     def update(self, dataset: Dataset, batch: Batch, encoded: LatentBatch) -> None:
-        """Update the clip with the most motion from a batch of validation clips and its latents."""
+        """Select the clip with the most motion among this batch of validation clips and earlier batches."""
         self._dataset = dataset
         for row, states in enumerate(encoded.states.double().cpu().numpy()):
             motion = dataset.spaces.state.compute_path_length(states)
             if motion > self._max_motion:
                 clip = encoded.select_clip(row)
-                copied = replace(clip, latents=clip.latents.detach().float().cpu().clone())  # frees the other clips
+                # A copy, so the memory of the other clips can be freed.
+                copied = replace(clip, latents=clip.latents.detach().float().cpu().clone())
                 self._max_motion, self._clip = motion, (replace(batch, latents=None), row, copied)
 
     def draw(self, world_model: WorldModel, device: torch.device, run: Path, step: int) -> np.ndarray | None:
-        """Write RUN/imagined/step-XXXXXXXX.png; return the image, None if none was drawn."""
+        """Write RUN/imagined/step-XXXXXXXX.png, and return the image; None if drawing failed."""
         try:
             image = draw_strip(make_strip(self.rollout(world_model, device, f"{run.name}, step {step:,}")))
             (run / IMAGINED).mkdir(exist_ok=True)
@@ -283,7 +285,7 @@ class ValidationStrip:
             ValueError: `update` was not called before.
         """
         if self._clip is None:
-            raise ValueError("no validation clip; call update first")
+            raise ValueError("no validation clip: call update first")
         batch, row, clip = self._clip
         if self._frames is None:
             self._frames = to_display_frames(frames_for_display(self._dataset, batch, row), world_model.image_size)

@@ -1,7 +1,7 @@
-"""Training of a decoder: encodes frames, trains, measures, and writes a folder for `--decoder`.
+"""Train a decoder: encode frames, train, measure, and write a folder for `--decoder`.
 
 The frames of a step are a function of (config, step), so a checkpoint contains only the weights, their average, AdamW's
-moments and the step. A training that was killed resumes exactly.
+moments and the step. A killed training resumes exactly.
 """
 
 from __future__ import annotations
@@ -68,56 +68,57 @@ from vjepa2_ac.storage import atomic_writer, check_local_writable, translate_wri
 from vjepa2_ac.storage.structured import utc_now
 
 KEY, PAIRS, STATE = "key.json", "pairs", "training.pt"
-_LOG_EVERY, _CHECKPOINT_EVERY = 50, 500  # steps; a short training saves three checkpoints
+_LOG_EVERY, _CHECKPOINT_EVERY = 50, 500  # steps; a shorter training saves a checkpoint after each third
 _HELD_OUT_FRAMES = 1_000
 _STRUCTURE, _EDGES = 0.2, 0.1  # weights of the second and the third term of the loss
-_SMALLEST = 11  # smallest side of an image in pixels: the window of MS-SSIM must fit
+_MIN_SIDE = 11  # minimum side of an image in pixels: the window of MS-SSIM must fit
 _SCALES = 3
 _WARMUP, _WARMUP_SHARE = 500, 15  # the warm-up has at most 500 steps, and at most 1/15 of all steps
 _WEIGHT_DECAY, _BETAS, _MAX_GRAD_NORM = 0.05, (0.9, 0.95), 1.0
-_AVERAGE, _AVERAGED_SHARE = 0.999, 4.5  # largest decay of the average; a short training averages over its last 22 %
-_AVERAGE_DELAY = 9.0  # early decays are at most step / (step + 9), so that the initial weights lose weight quickly
+# The decay of the weights' moving average has three limits. A short training has at most 1 - 4.5 / steps, so that it
+# averages over about its last 22 %. The limit step / (step + 9) lets the initial weights lose influence quickly.
+_MAX_DECAY, _AVERAGED_SHARE, _AVERAGE_DELAY = 0.999, 4.5, 9.0
 
 
 def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bool = False) -> Path:
-    """Train a decoder for the encoder and the data of a config; resume a training that was stopped.
+    """Train a decoder for the encoder and the data of a config, or resume a training that was stopped.
 
     Args:
-        config: Config with data, model and `decoder`.
+        config: Config with the sections `data`, `model` and `decoder`.
         reporter: Receives messages and the progress of each part of the work.
-        check_only: Run all checks, and write nothing.
+        check_only: Run all checks, but write nothing.
 
     Returns:
         The folder of the decoder.
 
     Raises:
         InputError: An input cannot be used, or the folder contains something else.
-        StoppedError: A signal asked to stop; the same command resumes.
+        StoppedError: A signal stopped the training; the same command resumes.
     """
     setup = _prepare(config, reporter)
     folder = setup.folder
     with RunLock(folder) as lock:
-        if is_done := (folder / CARD).is_file():
+        if is_finished := (folder / CARD).is_file():
             read_card(folder)
             reporter.note(f"{folder} contains a trained decoder; nothing to do.")
         else:
             _require_disk_space(setup, reporter)
         if check_only:
             return folder
-        if not is_done:
+        if not is_finished:
             lock.take()
             with translate_write_errors(folder):
                 write_atomically(folder / KEY, json.dumps({"key": dict(setup.key.parts)}, indent=1) + "\n")
             _run_trial_step(setup)
             _encode_and_train(setup, reporter)
             reporter.note(f"Saved the decoder to {folder} (PSNR and SSIM: {folder / CARD})")
-        shutil.rmtree(setup.files.folder, ignore_errors=True)  # also if an earlier start was killed before this line
+        shutil.rmtree(setup.files.folder, ignore_errors=True)  # may remain if a finished training was killed here
         (folder / STATE).unlink(missing_ok=True)
     return folder
 
 
 def _encode_and_train(setup: Setup, reporter: Reporter) -> None:
-    """Encode the frames, fit the linear decoder, train, measure, and write the decoder."""
+    """Encode the frames, fit the linear decoder, train the decoder from it, measure both, and write the folder."""
     device, config = setup.encoder.device, setup.config
     with stop_on_signals() as stop:
         pairs, held_out = (_encode_split(setup, split, reporter, stop) for split in ("train", "test"))
@@ -167,10 +168,10 @@ class Setup:
 
 
 def _prepare(config: Config, reporter: Reporter) -> Setup:
-    """Check and load config, folder, data and model.
+    """Load data and model, and check all inputs of the training.
 
     Raises:
-        InputError: One of these cannot be used.
+        InputError: The config, the folder, the data or the model cannot be used.
     """
     decoder = config.decoder
     folder = Path(config.run_dir).parent / "decoder" if decoder.folder is None else Path(decoder.folder)
@@ -191,8 +192,8 @@ def _prepare(config: Config, reporter: Reporter) -> Setup:
     reporter.task(LOADING)
     model = load_base(config.model, seed=config.seed)
     encoding, size, patch = get_encoding(model, config), model.image_size, model.sizes.patch_size
-    if patch % UPSAMPLED or size < _SMALLEST:
-        needed = f"images of at least {_SMALLEST} px, and a patch size that is a multiple of {UPSAMPLED} px"
+    if patch % UPSAMPLED or size < _MIN_SIDE:
+        needed = f"images of at least {_MIN_SIDE} px, and a patch size that is a multiple of {UPSAMPLED} px"
         raise InputError(where="model", found=f"images of {size} px in patches of {patch} px", needed=needed)
     key = CacheKey({
         "decoder": decoder.model_dump(mode="json", exclude={"folder"}),
@@ -216,20 +217,22 @@ def _require_disk_space(setup: Setup, reporter: Reporter) -> None:
     fix = "Lower decoder.frames, set data.cache_dtype: int8, or put decoder.folder on a larger disk"
     require_space(setup.folder, num_missing, per_frame, fix=fix)
     size = f"{num_missing * per_frame / 1e9:.3g} GB"
-    reporter.note(f"{count_frames(all_frames):,} frames; the training needs {size} of disk for frames and latents")
+    reporter.note(
+        f"Training with {count_frames(all_frames):,} frames. Their images and latents need {size} of disk space."
+    )
 
 
 def _run_trial_step(setup: Setup) -> None:
-    """Run one step on zeros as a memory check, before the frames are encoded."""
+    """Run one step on zeros on a GPU, so that missing memory is reported before the frames are encoded."""
     if setup.encoder.device.type == "cuda":
-        shape, count = setup.shape, setup.config.decoder.batch_size
-        latents = torch.zeros(count, shape.grid**2, shape.dim)
-        images = torch.zeros(count, 3, shape.image_size, shape.image_size).byte()
+        shape, batch_size = setup.shape, setup.config.decoder.batch_size
+        latents = torch.zeros(batch_size, shape.grid**2, shape.dim)
+        images = torch.zeros(batch_size, 3, shape.image_size, shape.image_size).byte()
         DecoderSteps(setup, None).run(1, PairBatch(latents, images, ()))
 
 
 def _encode_split(setup: Setup, split: Split, reporter: Reporter, stop: StopRequest) -> FramePairs:
-    """Encode the frames of a split that are not encoded yet; unreadable episodes follow `data.broken_episodes`."""
+    """Encode the frames of a split that are not encoded yet; `data.broken_episodes` applies to unreadable episodes."""
     report, frames, files = reporter.task(f"encoding {split} frames", "frames"), setup.frames[split], setup.files
 
     def progress(done: int, total: int) -> None:
@@ -241,54 +244,55 @@ def _encode_split(setup: Setup, split: Split, reporter: Reporter, stop: StopRequ
     encode_files(setup.dataset, missing, setup.encoder, files, progress, lossless_images=True)
     pairs = FramePairs.from_files(setup.dataset, frames, files)
     if frames and not len(pairs):
-        raise InputError(where=setup.config.data.path, found=f"no readable {split} frame", needed="one or more")
+        raise InputError(where=setup.config.data.path, found=f"no readable {split} frame", needed="at least one")
     return pairs
 
 
 def _train(setup: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Reporter, stop: StopRequest) -> None:
-    """Run all steps after the last saved one, and save checkpoints."""
-    config, saved = setup.config.decoder, setup.folder / STATE
-    first = 0
-    if saved.is_file():
-        state = read_torch(saved)
-        first = int(state["step"])
+    """Run all steps after the newest checkpoint, and save checkpoints."""
+    config, path = setup.config.decoder, setup.folder / STATE
+    num_done = 0  # steps before the newest checkpoint
+    if path.is_file():
+        state = read_torch(path)
+        num_done = int(state["step"])
         steps.decoder.load_state_dict(state["decoder"])
         steps.optimizer.load_state_dict(state["optimizer"])
         for name, value in steps.average.items():
             value.copy_(state["average"][name])
     progress = reporter.task("training the decoder", "steps")
     with (
-        MetricsLog(setup.folder, first_step=first) as log,
-        contextlib.closing(_iterate_batches(pairs, setup.config, first)) as batches,
+        MetricsLog(setup.folder, first_step=num_done) as log,
+        contextlib.closing(_iterate_batches(pairs, setup.config, num_done)) as batches,
     ):
-        every = max(1, min(_CHECKPOINT_EVERY, config.steps // 3))
+        checkpoint_every = max(1, min(_CHECKPOINT_EVERY, config.steps // 3))
         for step, batch in batches:
             metrics = steps.run(step, batch)
             progress(step, config.steps)
             is_last = step == config.steps
             if step % _LOG_EVERY == 0 or is_last:
                 log.write("train", step, metrics)
-            if step % every == 0 or is_last or stop.reason is not None:
-                with log.flush_before_checkpoint(), translate_write_errors(saved), atomic_writer(saved) as file:
-                    parts = {"decoder": steps.decoder.state_dict(), "optimizer": steps.optimizer.state_dict()}
-                    write_torch({"step": step, "average": steps.average, **parts}, file)
+            if step % checkpoint_every == 0 or is_last or stop.reason is not None:
+                with log.flush_before_checkpoint(), translate_write_errors(path), atomic_writer(path) as file:
+                    states = {"decoder": steps.decoder.state_dict(), "optimizer": steps.optimizer.state_dict()}
+                    write_torch({"step": step, "average": steps.average, **states}, file)
             if stop.reason is not None and not is_last:
                 raise StoppedError(setup.folder, step, stop.reason)
 
 
-def _iterate_batches(pairs: FramePairs, config: Config, done: int) -> Generator[tuple[int, PairBatch], None, None]:
-    """Yield the frames of each step after `done`; the next batch is read in the background."""
-    size, count, seed = config.decoder.batch_size, len(pairs), config.seed
+def _iterate_batches(pairs: FramePairs, config: Config, num_done: int) -> Generator[tuple[int, PairBatch], None, None]:
+    """Yield (step, batch) for each step after step `num_done`; the next batch is read in the background."""
+    size, num_pairs, seed = config.decoder.batch_size, len(pairs), config.seed
 
     def read(step: int) -> PairBatch:
         positions = range((step - 1) * size, step * size)
-        return pairs.read(
-            [permute_index(position % count, size=count, seed=seed, epoch=position // count) for position in positions]
-        )
+        return pairs.read([
+            permute_index(position % num_pairs, size=num_pairs, seed=seed, epoch=position // num_pairs)
+            for position in positions
+        ])  # fmt: skip
 
     with ThreadPoolExecutor(1, thread_name_prefix="pairs") as pool:
-        next_batch = pool.submit(read, done + 1)
-        for step in range(done + 1, config.decoder.steps + 1):
+        next_batch = pool.submit(read, num_done + 1)
+        for step in range(num_done + 1, config.decoder.steps + 1):
             batch = next_batch.result()
             next_batch = pool.submit(read, step + 1)
             yield step, batch
@@ -298,13 +302,13 @@ def _iterate_batches(pairs: FramePairs, config: Config, done: int) -> Generator[
 
 
 def decoder_loss(images: Images, targets: Images) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
-    """Return the loss L1 + 0.2 (1 - MS-SSIM) + 0.1 L1 of the image gradients along both axes, and its terms.
+    """Return the loss and its terms: L1 + 0.2 (1 - MS-SSIM) + 0.1 (L1 of the image gradients along both axes).
 
     Args:
         images: Outputs of the decoder, not clipped.
         targets: The encoder's input, between 0 and 1.
     """
-    scales = sum(images.shape[-1] >= _SMALLEST << scale for scale in range(_SCALES))
+    scales = sum(images.shape[-1] >= _MIN_SIDE << scale for scale in range(_SCALES))
     absolute = (images - targets).abs().mean()
     structure = 1.0 - ms_ssim(images, targets, scales=scales).mean()
     rows, columns = ((images.diff(dim=axis) - targets.diff(dim=axis)).abs().mean() for axis in (-2, -1))
@@ -318,8 +322,8 @@ def learning_rate_at(step: int, config: DecoderConfig) -> float:
     warmup = min(_WARMUP, config.steps // _WARMUP_SHARE)
     if step <= warmup:
         return config.learning_rate * step / warmup
-    done = (step - warmup) / max(1, config.steps - warmup)
-    return config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done))
+    progress = (step - warmup) / max(1, config.steps - warmup)
+    return config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * progress))
 
 
 class DecoderSteps:
@@ -356,19 +360,19 @@ class DecoderSteps:
         needs_loss_scale = self._config.training.precision == "fp16"  # not implemented here, so float32 is used
         with contextlib.nullcontext() if needs_loss_scale else autocast(self._config.training, self._device):
             decoded = self.decoder(latents)
-        loss, parts = decoder_loss(decoded, images)
+        loss, terms = decoder_loss(decoded, images)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch
         norm = torch.nn.utils.clip_grad_norm_(self.decoder.parameters(), _MAX_GRAD_NORM)
-        values = {"loss": loss, **parts, "gradient_norm": norm}
-        read = torch.stack([value.detach().float() for value in values.values()]).tolist()  # waits for the device once
-        metrics = dict(zip(values, read, strict=True))
+        tensors = {"loss": loss, **terms, "gradient_norm": norm}
+        values = torch.stack([value.detach().float() for value in tensors.values()]).tolist()  # one synchronisation
+        metrics = dict(zip(tensors, values, strict=True))
         if not math.isfinite(metrics["gradient_norm"]):
             problem = f"{self._config.decoder.learning_rate:g}; loss or gradients of step {step} are not finite"
             fix = f"Lower it and start again; delete {STATE} if it was saved after the loss had diverged"
             raise InputError(where="decoder.learning_rate", found=problem, fix=fix)
         self.optimizer.step()
-        decay = min(_AVERAGE, 1 - _AVERAGED_SHARE / self._config.decoder.steps, step / (step + _AVERAGE_DELAY))
+        decay = min(_MAX_DECAY, 1 - _AVERAGED_SHARE / self._config.decoder.steps, step / (step + _AVERAGE_DELAY))
         for name, tensor in self.decoder.state_dict().items():  # detached tensors
             self.average[name].lerp_(tensor, 1.0 - decay)
         return metrics | {"learning_rate": learning_rate}
