@@ -177,7 +177,7 @@ def test_an_installed_module_is_not_shadowed_by_one_in_the_working_directory(wri
     write("p_entry", PWNED)
     leave_package(site, "p_shadowed", "", REGISTERS.format(name="p_shadowed", function="f"))
     leave_package(site, "p_entry", "[vjepa2_ac.losses]\np_entry = p_entry:thing\n")
-    import_plugins(["p_shadowed"], where="run/config.yaml", here=False)
+    import_plugins(["p_shadowed"], where="run/config.yaml", allow_local=False)
     assert LOSSES.find("p_shadowed").__module__ == "p_shadowed"
     assert LOSSES.find("p_entry") is print
     assert not Path("PWNED").exists()
@@ -190,7 +190,7 @@ def test_an_installed_module_that_is_no_plugin_is_not_imported_for_a_run(write: 
     for module in ("p_other", "antigravity"):
         sys.modules.pop("p_other", None)
         with pytest.raises(InputError, match=f"'{module}' registers nothing"):
-            import_plugins([module], where="run/config.yaml", here=False)
+            import_plugins([module], where="run/config.yaml", allow_local=False)
     assert not Path("PWNED").exists()
     assert "antigravity" not in sys.modules
 

@@ -93,7 +93,7 @@ def read_clips(dataset: Dataset, split: Split = "train", *, clips: int = 16, bat
         batch_size: Number of clips per batch; the last batch may have fewer.
 
     Yields:
-        Batches of `frames` (clips x time x height x width x 3, uint8, RGB, cropped; None of a latent cache), `states`
+        Batches of `frames` (clips x time x height x width x 3, uint8, RGB, cropped; None for cached latents), `states`
         (clips x time x 7: metres, radians, closedness), `actions` (clips x time-1 x 7: the changes), `episode_ids` and
         `starts` (control steps). Axes, units and coordinate frames: `vjepa2_ac.episode`.
 
@@ -131,7 +131,7 @@ def encode(
 
     Returns:
         For frames: latents with the same leading axes x tokens x dim, float32, layer-normalised. For a batch: a record
-        with its `latents` (clips x time x tokens x dim), `states` and `actions`, all on the device.
+        with `latents` (clips x time x tokens x dim), and with the batch's `states` and `actions`, all on the device.
 
     Raises:
         InputError: The frames are invalid, or the model needs camera poses that the batch does not have.

@@ -1,9 +1,9 @@
-"""Device selection, and data-parallel processes: they share the clips and sum gradients; the first process writes.
+"""Select the device, and coordinate data-parallel processes, which share the clips and sum their gradients.
 
-The processes are started by torchrun, by `accelerate launch`, or by any other launcher that sets RANK, LOCAL_RANK,
-WORLD_SIZE, MASTER_ADDR and MASTER_PORT. Gradients are summed once per optimizer step, after the last micro-batch, and
-not by DistributedDataParallel: a process may have no clip in a micro-batch (`data.broken_episodes: skip`), for which
-DistributedDataParallel would wait forever.
+Only the first process writes files. The processes are started by torchrun, by `accelerate launch`, or by any other
+launcher that sets RANK, LOCAL_RANK, WORLD_SIZE, MASTER_ADDR and MASTER_PORT. Gradients are summed once per optimizer
+step, after the last micro-batch, and not by DistributedDataParallel: a process may have no clip in a micro-batch
+(`data.broken_episodes: skip`), for which DistributedDataParallel would wait forever.
 
 Work that only some processes do may take hours (an index, a checkpoint on a slow disk) or fail. `run_on_first`,
 `run_first_per_machine` and `run_on_all` let the other processes wait without a timeout, and raise an error of the work
@@ -39,7 +39,10 @@ from vjepa2_ac.process import StoppedError
 _log = logging.getLogger(__name__)
 
 PRECISIONS = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
-_BF16_FROM = (8, 0)  # compute capability; PyTorch's is_bf16_supported includes emulation, which is slower than fp32
+_BF16_CAPABILITY = (
+    8,
+    0,
+)  # compute capability; PyTorch's is_bf16_supported includes emulation, which is slower than fp32
 _TIMING_S = 0.2  # duration of the timing of a matrix product
 _CUDA_MATRIX, _CPU_MATRIX = 8192, 512
 _SLOW = 2.0  # bfloat16 is slow on a CPU if a matrix product takes this many times as long as in float32
@@ -62,7 +65,7 @@ _NO_TIMEOUT = timedelta(days=7)  # for work of unknown duration
 
 
 def is_on_cpu(training: TrainingConfig) -> bool:
-    """Return whether a config uses the CPU, not CUDA.
+    """Return whether a config uses the CPU instead of CUDA.
 
     Raises:
         InputError: CUDA was requested but is not available.
@@ -143,7 +146,7 @@ def measure_matmul_speed(device: torch.device, dtype: torch.dtype) -> float:
 
 def has_bf16(device: torch.device | None = None) -> bool:
     """Return whether a CUDA device supports bfloat16; without an index, whether the device of this process does."""
-    return torch.cuda.get_device_capability(_index_of(device)) >= _BF16_FROM
+    return torch.cuda.get_device_capability(_index_of(device)) >= _BF16_CAPABILITY
 
 
 def _index_of(device: torch.device | None) -> int:
@@ -164,7 +167,7 @@ def autocast(training: TrainingConfig, device: torch.device) -> torch.autocast:
 def _require_bf16(device: torch.device, *, where: str, value: str, fix: str) -> None:
     """Raise if a GPU only emulates bfloat16; log a warning if a CPU is slow with it."""
     if device.type == "cpu":
-        _warn(f"{where}: {value}", fix)
+        _warn_if_slow(f"{where}: {value}", fix)
     if device.type != "cuda" or has_bf16(device):
         return
     index = _index_of(device)
@@ -175,7 +178,7 @@ def _require_bf16(device: torch.device, *, where: str, value: str, fix: str) -> 
 
 
 @cache  # warns once
-def _warn(setting: str, fix: str) -> None:
+def _warn_if_slow(setting: str, fix: str) -> None:
     if slow := bf16_slowdown():
         _log.warning("%s: %s. %s", setting, slow, fix)
 

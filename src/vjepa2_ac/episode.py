@@ -77,13 +77,13 @@ FrameReader = Callable[[Sequence[int]], UInt8[np.ndarray, "time height width 3"]
 
 @dataclass(frozen=True)
 class StoredLatents:
-    """Latents of frames as a cache stores them; `latent_files.unpack_latents` makes them float32 on the device."""
+    """Latents of frames in the type of the cache. `latent_files.unpack_latents` converts them to float32."""
 
     values: Num[Tensor, "*batch time tokens dim"]  # bfloat16, float32 or int8
     scales: Float32[Tensor, "*batch time tokens"] | None = None  # for int8: the scale of each token
 
     def map_tensors(self, change: Callable[[Tensor], Tensor]) -> StoredLatents:
-        """Return the latents with each tensor replaced."""
+        """Return the latents with each tensor replaced by the result of `change`."""
         return StoredLatents(change(self.values), None if self.scales is None else change(self.scales))
 
 
@@ -156,7 +156,7 @@ class Batch:
     skipped: tuple[SkippedClip, ...] = ()  # clips that could not be read
 
     def map_tensors(self, change: Callable[[Tensor], Tensor]) -> Batch:
-        """Return the batch with each tensor replaced."""
+        """Return the batch with each tensor replaced by the result of `change`."""
         return replace(
             self,
             frames=None if self.frames is None else change(self.frames),

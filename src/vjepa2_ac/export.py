@@ -121,7 +121,7 @@ def _write_hub(checkpoint: Path, folder: Path, destination: Path, card: str, met
             if (folder / PLOT).is_file():
                 shutil.copyfile(folder / PLOT, fresh / PLOT)
             written = json.loads((folder / METRICS_FILE).read_bytes())  # paths of this machine are removed
-            written["about"] |= {"subject": folder.resolve().name, "checkpoint_path": _measured(metrics)}
+            written["about"] |= {"subject": folder.resolve().name, "checkpoint_path": _evaluated_checkpoint(metrics)}
             written["summary"] |= {"subject": folder.resolve().name}
             write_atomically(fresh / METRICS_FILE, json.dumps(written, indent=1))
         write_atomically(fresh / CARD, card)
@@ -137,9 +137,9 @@ def _card(run: Subject, checkpoint: Path, folder: Path, metrics: Metrics | None)
         trim_blocks=True,
         keep_trailing_newline=True,
     )
-    code = lambda name: f"`{escaped(str(name)).replace('`', '_')}`"  # noqa: E731 - names are no markup in a span of code
+    code = lambda name: f"`{escaped(str(name)).replace('`', '_')}`"  # noqa: E731 - a code span shows names literally
     environment.filters |= {"code": code, "count": counted, "ratio": _ratio}
-    measured = None if metrics is None else _measured(metrics)
+    measured = None if metrics is None else _evaluated_checkpoint(metrics)
     summary = None
     if metrics is not None:  # a closed-loop benchmark may be newer than metrics.json
         summary = with_closed_loop(replace(metrics.summary, subject=name), folder, metrics.about.checkpoint)
@@ -169,7 +169,7 @@ def _card(run: Subject, checkpoint: Path, folder: Path, metrics: Metrics | None)
     )
 
 
-def _measured(metrics: Metrics) -> str:
+def _evaluated_checkpoint(metrics: Metrics) -> str:
     """Return the name of the checkpoint that was evaluated."""
     return PurePath(metrics.about.checkpoint_path).name
 

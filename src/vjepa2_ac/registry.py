@@ -111,7 +111,7 @@ class Registry:
         Args:
             name: Name of the object.
             values: Its options.
-            at: Location of the options below the config key that is checked, for messages.
+            at: Location of the options relative to the validated config key, for messages.
 
         Raises:
             ValueError: The options are invalid, or the object has no options.
@@ -258,37 +258,37 @@ def load_entry_point(entry_point: EntryPoint) -> Any:
         InputError: The object cannot be imported.
     """
     with _installed_only():
-        return _imported(entry_point.load, f"{entry_point.name} = {entry_point.value}", entry_point.group)
+        return _load_or_refuse(entry_point.load, f"{entry_point.name} = {entry_point.value}", entry_point.group)
 
 
-def import_plugins(modules: Iterable[str], *, where: str, here: bool = True) -> None:
+def import_plugins(modules: Iterable[str], *, where: str, allow_local: bool = True) -> None:
     """Import modules that register objects.
 
     Args:
         modules: Names of the modules.
         where: Where the modules are named, for messages.
-        here: As for `import_user_module`.
+        allow_local: As for `import_user_module`.
 
     Raises:
         InputError: As for `import_user_module`; or a module registers nothing.
     """
     for module in modules:
         before = len(_registered)
-        import_user_module(module, where=where, here=here)
+        import_user_module(module, where=where, allow_local=allow_local)
         if len(_registered) > before or _package(module) in _registered:
             _plugins.add(module)
         if module not in _plugins:
             _refuse(module, where)
 
 
-def import_user_module(module: str, *, where: str, here: bool = True) -> ModuleType:
+def import_user_module(module: str, *, where: str, allow_local: bool = True) -> ModuleType:
     """Import a module of the user.
 
     Args:
         module: Name of the module.
         where: Where the module is named, for messages.
-        here: Whether the module may be in the working directory. False for modules named by a run, which may be from a
-            third party: then only installed packages that mention this one are imported.
+        allow_local: Whether the module may be in the working directory. False for modules that a run names, because a
+            run may be from a third party. Then only installed packages that mention this package are imported.
 
     Raises:
         InputError: There is no such module, or it cannot be imported.
@@ -301,16 +301,20 @@ def import_user_module(module: str, *, where: str, here: bool = True) -> ModuleT
     if module in sys.modules:
         return sys.modules[module]
     package = _package(module)
-    with contextlib.nullcontext() if here else _installed_only():
-        if here and find_spec(package) is None:
+    with contextlib.nullcontext() if allow_local else _installed_only():
+        if allow_local and find_spec(package) is None:
             sys.path.append(str(Path.cwd()))
         spec = find_spec(package)
         if spec is None:
-            fix = "Install it, or run the command in its folder" if here else f"Install it, or add --plugin {module}"
+            fix = (
+                "Install it, or run the command in its folder"
+                if allow_local
+                else f"Install it, or add --plugin {module}"
+            )
             raise InputError(where=where, found=f"plugin {module!r}: no such module", fix=fix)
-        if not (here or _mentions_this_package(spec)):
+        if not (allow_local or _mentions_this_package(spec)):
             _refuse(module, where)
-        return _imported(lambda: import_module(module), f"plugin {module!r}", where)
+        return _load_or_refuse(lambda: import_module(module), f"plugin {module!r}", where)
 
 
 def _mentions_this_package(spec: ModuleSpec) -> bool:
@@ -339,8 +343,8 @@ def _installed_only() -> Iterator[None]:
         sys.path[:] = [*before, *(path for path in sys.path if path not in before)]
 
 
-def _imported(load: Callable[[], _Thing], what: str, where: str) -> _Thing:
-    """Return the imported object; any exception becomes one error with the line of the plugin."""
+def _load_or_refuse(load: Callable[[], _Thing], what: str, where: str) -> _Thing:
+    """Return the result of `load`. Any exception becomes an `InputError` with the line of the plugin."""
     try:
         return load()
     except (Exception, SystemExit) as error:

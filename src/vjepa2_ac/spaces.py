@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 MAX_POSITION_M = 5.0  # larger positions are not in metres
 MAX_ANGLE_RAD = 2 * math.pi + 0.1  # larger angles are not in radians
-_LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw is determined
+_GIMBAL_LOCK = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw is determined
 GRIPPER_SLACK = 0.1  # a measured closedness may exceed 0 .. 1 by this
 CONVERSIONS = {  # conversions from other units to metres and radians
     "millimetres": "divide them by 1000",
     "centimetres": "divide them by 100",
     "degrees": "multiply them by pi / 180",
 }
-_MAX_CM, _MAX_MM, _MAX_DEGREES = 100.0, 5000.0, 360.5  # of positions and angles that look like these units
+_MAX_CM, _MAX_MM, _MAX_DEGREES = 100.0, 5000.0, 360.5  # largest values that are recognised as these units
 
 ActionEffect = Literal["change", "target", "unknown"]
 
@@ -66,23 +66,24 @@ def euler_from_matrices(matrices: Any) -> Any:
     if isinstance(matrices, np.ndarray):
         return Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_euler("xyz").reshape(*matrices.shape[:-2], 3)
     torch = sys.modules["torch"]
-    flat = torch.hypot(matrices[..., 0, 0], matrices[..., 1, 0])  # cos(pitch), which is never negative
-    locked = flat < _LOCKED
-    cosine = torch.hypot(*(torch.where(locked, 1.0, matrices[..., row, 0]) for row in (0, 1)))
-    pitch = torch.atan2(-matrices[..., 2, 0], torch.where(locked, 0.0, cosine))
+    is_locked = torch.hypot(matrices[..., 0, 0], matrices[..., 1, 0]) < _GIMBAL_LOCK  # cos(pitch) is never negative
+    cosine = torch.hypot(*(torch.where(is_locked, 1.0, matrices[..., row, 0]) for row in (0, 1)))
+    pitch = torch.atan2(-matrices[..., 2, 0], torch.where(is_locked, 0.0, cosine))
     roll = torch.atan2(
-        torch.where(locked, -matrices[..., 1, 2], matrices[..., 2, 1]),
-        torch.where(locked, matrices[..., 1, 1], matrices[..., 2, 2]),
+        torch.where(is_locked, -matrices[..., 1, 2], matrices[..., 2, 1]),
+        torch.where(is_locked, matrices[..., 1, 1], matrices[..., 2, 2]),
     )
-    yaw = torch.atan2(torch.where(locked, 0.0, matrices[..., 1, 0]), torch.where(locked, 1.0, matrices[..., 0, 0]))
+    yaw = torch.atan2(
+        torch.where(is_locked, 0.0, matrices[..., 1, 0]), torch.where(is_locked, 1.0, matrices[..., 0, 0])
+    )
     return torch.stack([roll, pitch, yaw], -1)
 
 
 def actions_from_states(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time-1 7"]:
     """Return the action from each state to the next.
 
-    Translation and gripper subtract; rotation is R[t+1] @ R[t].T as extrinsic xyz Euler angles, so an action acts on
-    the left. Conventions of states and actions: `vjepa2_ac.episode`.
+    Positions and grippers are subtracted. The rotation is R[t+1] @ R[t].T as extrinsic xyz Euler angles, so an action
+    is multiplied from the left. Conventions of states and actions: `vjepa2_ac.episode`.
 
     Raises:
         ValueError: Fewer than two states.
@@ -111,7 +112,7 @@ def compute_step_sizes(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray,
 
 
 def apply_action(state: Any, action: Any) -> Any:
-    """Return the poses [*batch 7] that actions [*batch 7] lead to: xyz and gripper add, R' = R_delta @ R.
+    """Return the poses [*batch 7] after actions [*batch 7]: xyz and gripper are added, and R' = R_delta @ R.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, compute_new_pose.
     """

@@ -94,7 +94,7 @@ def test_slow_bfloat16_on_a_cpu_causes_a_warning_with_a_fix(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(distributed, "measure_matmul_speed", lambda _, dtype: 1e9 if dtype == torch.bfloat16 else 6e10)
-    distributed._warn.cache_clear()
+    distributed._warn_if_slow.cache_clear()
     through("train", monkeypatch, tmp_path)
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
     assert "60 times as long as in float32" in line

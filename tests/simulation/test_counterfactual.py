@@ -118,12 +118,12 @@ def test_docs_example_runs(recorded, capsys: pytest.CaptureFixture[str]) -> None
 def test_resimulating_a_changed_recording_raises(recorded, tmp_path: Path) -> None:
     episode = episode_of(recorded("A"))
     moved = replace(episode, states=episode.states + 1e-3)
-    with pytest.raises(InputError, match=r"control step 4: .*the state differs by up to 0\.001"):
+    with pytest.raises(InputError, match=r"control step 4: .*the resimulated state differs by up to 0\.001"):
         resimulate(recorded("A"), moved, START)
     values = json.loads((recorded("A") / SIMULATION_FILE).read_text())
     values["domain"]["lag_s"] = 0.2
     (tmp_path / SIMULATION_FILE).write_text(json.dumps(values))
-    with pytest.raises(InputError, match=r"the state differs.*simulation\.json names"):
+    with pytest.raises(InputError, match=r"the resimulated state differs.*simulation\.json names"):
         resimulate(tmp_path, episode, START)
 
 

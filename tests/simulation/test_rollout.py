@@ -128,7 +128,7 @@ def test_invalid_action_raises(arm: SimulatedArm) -> None:
     for action in (np.zeros(6), np.full(7, np.nan)):
         with pytest.raises(ValueError, match="not an action of 7 or 8 finite numbers"):
             run_trial(ArmEnvironment(arm), Scripted(action), trial_of(1, steps=1))
-    with pytest.raises(ValueError, match="none of the simulated arm"):
+    with pytest.raises(ValueError, match="no problem of the simulated arm"):
         Oracle(LIMITS).reset(Trial(0, 1, 1), UNSEEN)
 
 

@@ -325,7 +325,7 @@ def with_plugins(values: Mapping[str, Any], *, where: str, local_plugins: bool) 
     import_plugins(
         [module for module in plugins if module not in _command_line_plugins],
         where=f"{where}: plugins",
-        here=local_plugins,
+        allow_local=local_plugins,
     )
     replay = values.get("replay")
     for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):

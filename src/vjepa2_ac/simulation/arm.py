@@ -49,7 +49,7 @@ class SimulatedArm:
     def __init__(self, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE, views: int = 1) -> None:
         self.domain, self._views = domain, tuple(_EXTERIOR_TURNS_DEG)[:views]
         self._mujoco = load_mujoco()
-        self._model = self._compiled(domain)
+        self._model = self._compile(domain)
         self._data = self._mujoco.MjData(self._model)
         self._size = size
         self._cameras: dict[str, RayCamera] = {}
@@ -124,14 +124,14 @@ class SimulatedArm:
 
     def command_joints(self, goal: Joints, closedness: float, control_steps: int = 1) -> State:
         """Move joints (radians) and gripper towards a target for some control steps; return the measured state."""
-        left = (1.0 - tracking_share(self.domain.lag_s)) ** control_steps
-        grip_left = (1.0 - tracking_share(GRIPPER_LAG_S)) ** control_steps
-        joints = goal + left * (self.joints - goal)
-        self.set_joints(joints, closedness + grip_left * (self._closedness - closedness), control_steps)
+        remaining = (1.0 - tracking_share(self.domain.lag_s)) ** control_steps  # share of the distance to the target
+        grip_remaining = (1.0 - tracking_share(GRIPPER_LAG_S)) ** control_steps
+        joints = goal + remaining * (self.joints - goal)
+        self.set_joints(joints, closedness + grip_remaining * (self._closedness - closedness), control_steps)
         return self.state
 
     def image(self, camera: str | None = None) -> UInt8[np.ndarray, "height width 3"]:
-        """Return the current image of `exterior_1`, `exterior_2` or `wrist`; None: of all views of this arm.
+        """Return the current image of `exterior_1`, `exterior_2` or `wrist`; None: of all views, side by side.
 
         Raises:
             ValueError: There is no such camera.
@@ -157,7 +157,7 @@ class SimulatedArm:
         pose = np.linalg.inv(self.domain.base_pose()) @ self._camera_pose(camera)
         return np.concatenate([pose[:3, 3], euler_from_matrices(pose[:3, :3])])
 
-    def _compiled(self, domain: Domain) -> Any:
+    def _compile(self, domain: Domain) -> Any:
         return compile_scene(domain)
 
     def _pass_time(self, control_steps: int) -> None:
@@ -169,7 +169,7 @@ class SimulatedArm:
         if camera in _EXTERIOR_TURNS_DEG:
             return self.domain.camera.turned(_EXTERIOR_TURNS_DEG[camera]).pose()
         if camera != "wrist":
-            raise ValueError(f"no camera {camera!r}: wrist, {', '.join(_EXTERIOR_TURNS_DEG)}")
+            raise ValueError(f"camera: {camera!r}. Expected wrist, {' or '.join(_EXTERIOR_TURNS_DEG)}")
         site = self._data.site("flange")
         mount, flange = np.eye(4), np.eye(4)
         mount[:3, :3] = Rotation.from_euler("ZX", [45.0, 12.0], degrees=True).as_matrix()
@@ -198,8 +198,8 @@ class _Circles:
 
 StepCallback = Callable[[SimulatedArm], None]  # called at every control step, at the time of its measurements
 
-_GRIP_STAYS = 0.05  # smaller changes of the gripper command are ignored, so that the gripping force is constant
-_MOVED, _FINGERS, _BLOCK = slice(0, 9), slice(7, 9), slice(9, 16)  # parts of qpos
+_MIN_GRIP_CHANGE = 0.05  # smaller changes of the gripper command are ignored, so that the gripping force is constant
+_ACTUATED, _FINGERS, _BLOCK = slice(0, 9), slice(7, 9), slice(9, 16)  # indices in qpos; the first also in qvel
 
 
 class ContactArm(SimulatedArm):
@@ -248,28 +248,28 @@ class ContactArm(SimulatedArm):
     def set_joints(self, joints: Joints, closedness: float, control_steps: int = 1) -> None:
         """Set the joint angles directly, at rest; a grasped object is released."""
         super().set_joints(joints, closedness, control_steps)
-        self._data.qvel[_MOVED] = 0.0
+        self._data.qvel[_ACTUATED] = 0.0
         self._data.qacc_warmstart[:] = 0.0
-        self._setpoint = self._data.qpos[_MOVED].copy()
+        self._setpoint = self._data.qpos[_ACTUATED].copy()
         self._grip = closedness
 
     def command_joints(self, goal: Joints, closedness: float, control_steps: int = 1) -> State:
         """Move joints (radians) and gripper towards a target for some control steps; return the measured state."""
-        if abs(closedness - self.closedness) > _GRIP_STAYS:
+        if abs(closedness - self.closedness) > _MIN_GRIP_CHANGE:
             self._grip = closedness
-        ends = np.append(goal, [FINGER_TRAVEL_M * (1.0 - self._grip)] * 2)
+        target = np.append(goal, [FINGER_TRAVEL_M * (1.0 - self._grip)] * 2)
         for _ in range(control_steps * SUBSTEPS):
-            change = self._share * (ends - self._setpoint)
+            change = self._tracking_share * (target - self._setpoint)
             self._setpoint += change
-            self._data.ctrl[:] = self._setpoint + self._ahead * change  # compensates the servos' damping
+            self._data.ctrl[:] = self._setpoint + self._lead * change  # compensates the servos' damping
             self._mujoco.mj_step(self._model, self._data)
         self._pass_time(control_steps)
         self._mujoco.mj_kinematics(self._model, self._data)
         return self.state
 
-    def _compiled(self, domain: Domain) -> Any:
+    def _compile(self, domain: Domain) -> Any:
         model = compile_scene(domain, block=True, mark=self._has_mark)
         lags = np.array([domain.lag_s] * 7 + [GRIPPER_LAG_S] * 2)
-        self._share = 1.0 - np.exp(-model.opt.timestep / lags)
-        self._ahead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0] / model.opt.timestep
+        self._tracking_share = 1.0 - np.exp(-model.opt.timestep / lags)  # per physics step
+        self._lead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0] / model.opt.timestep
         return model

@@ -143,7 +143,7 @@ VIDEO_FILE = "closed_loop.mp4"
 FORMAT = 2  # incremented at changes that require changes of readers
 
 SubGoals = Literal["none", "demonstration", "every-step"]
-_HELP = {
+_SUB_GOALS_TEXT = {
     "demonstration": ", with key frames of the oracle's solution as sub-goals",
     "every-step": ", with each step of the oracle's solution as sub-goal",
 }
@@ -226,7 +226,7 @@ class ClosedLoopBenchmark:
     @property
     def conditions(self) -> str:
         """The domain or environment, and the sub-goals of the model, as text."""
-        return f"in {self.trials.place}{_HELP.get(self.trials.about['sub_goals'], '')}"
+        return f"in {self.trials.place}{_SUB_GOALS_TEXT.get(self.trials.about['sub_goals'], '')}"
 
 
 def run_benchmark(subject: Subject, options: BenchmarkOptions, reporter: Reporter = SILENT) -> ClosedLoopBenchmark:
@@ -277,7 +277,10 @@ def demonstrated_goals(
 
 
 def demonstrate(trial: Trial, arm: SimulatedArm, limits: LimitsConfig) -> EpisodeResult:
-    """Let the oracle solve a problem; return the episode with its frames. Arguments, errors: `demonstrated_goals`."""
+    """Let the oracle solve a problem, and return the episode with its frames.
+
+    Arguments and errors are those of `demonstrated_goals`.
+    """
     task: TaskName = "reach" if trial.problem is None else trial.problem.task
     steps = max(trial.steps, STEPS[task])
     free = limits.model_copy(update={"gripper_mode": "free", "gripper": LimitsConfig().gripper})

@@ -18,10 +18,10 @@ Point = Float[np.ndarray, " 3"]
 Spots = Float[np.ndarray, "spots 3"]  # points on surfaces
 Rays = Float[np.ndarray, "rays 3"]  # unit vectors
 
-_SKIN_M = 6e-3  # tolerance with which a point does not shade itself
+_SKIN_M = 6e-3  # a hit that is closer to a point than this does not shade the point
 _LAMP_M = 2.2  # distance of the lamp from the origin of the world
 _LAMP_CELLS = 160  # cells along each edge of the lamp's view
-_LAMP_HALF_VIEW = 1.6  # tangent of half its opening angle; the arm is always inside
+_LAMP_HALF_VIEW = 1.6  # tangent of half the opening angle of the lamp's view, which always contains the arm
 
 
 class Hits(NamedTuple):
@@ -76,25 +76,27 @@ class View:
         self.origin, self._rotation = pose[:3, 3].copy(), pose[:3, :3]
         self.rays = rays
         self._half_view, self._cells = half_view, np.array(cells)
-        inside = rays @ self._rotation
-        ahead = inside[:, 2] > 1e-6
-        column, row = self._cell(inside[:, :2] / np.where(ahead, inside[:, 2], 1.0)[:, None]).T
-        is_in_grid = ahead & (column >= 0) & (column < cells[0]) & (row >= 0) & (row < cells[1])
+        local_rays = rays @ self._rotation
+        is_ahead = local_rays[:, 2] > 1e-6
+        column, row = self._cell(local_rays[:, :2] / np.where(is_ahead, local_rays[:, 2], 1.0)[:, None]).T
+        is_in_grid = is_ahead & (column >= 0) & (column < cells[0]) & (row >= 0) & (row < cells[1])
         self._index = np.where(is_in_grid, row * cells[0] + column, cells[0] * cells[1]).astype(np.int64)
 
     def near_arm(self, caster: Caster, data: Any) -> Int[np.ndarray, " near"]:
         """Return the indices of the rays that may hit the arm, by the bounding spheres of its geoms."""
-        radii, inside = caster.radii, (data.geom_xpos[caster.arm] - self.origin) @ self._rotation
-        ends = inside[:, 2] - radii, inside[:, 2] + radii
-        if ends[0].min() <= 0.0:  # the view is inside the arm
+        radii, centres = caster.radii, (data.geom_xpos[caster.arm] - self.origin) @ self._rotation
+        depths = centres[:, 2] - radii, centres[:, 2] + radii  # of the nearest and the farthest point of each sphere
+        if depths[0].min() <= 0.0:  # the view is inside the arm
             return np.arange(len(self.rays))
-        edges = np.stack([(inside[:, :2] + sign * radii[:, None]) / end[:, None] for sign in (-1, 1) for end in ends])
+        edges = np.stack(
+            [(centres[:, :2] + sign * radii[:, None]) / depth[:, None] for sign in (-1, 1) for depth in depths]
+        )
         low = np.clip(self._cell(edges.min(axis=0)), 0, self._cells).astype(int)
         high = np.clip(self._cell(edges.max(axis=0)) + 1, 0, self._cells).astype(int)
-        touched = np.zeros((self._cells[1], self._cells[0]), dtype=bool)
+        is_near = np.zeros((self._cells[1], self._cells[0]), dtype=bool)  # per cell
         for (left, top), (right, bottom) in zip(low, high, strict=True):
-            touched[top:bottom, left:right] = True
-        return np.flatnonzero(np.append(touched.reshape(-1), False)[self._index])
+            is_near[top:bottom, left:right] = True
+        return np.flatnonzero(np.append(is_near.reshape(-1), False)[self._index])
 
     def _cell(self, slopes: Float[np.ndarray, "rays 2"]) -> Float[np.ndarray, "rays 2"]:
         """Return column and row, as whole numbers in floating point."""
@@ -158,37 +160,37 @@ class RayCamera:
 
     def image(self, data: Any) -> UInt8[np.ndarray, "height width 3"]:
         """Return the image of this `mujoco.MjData`, whose kinematics must be up to date."""
-        behind = self._background = self._background or self._see_background(data)
-        pixels = behind.lit.copy()
-        near = behind.from_lamp.near_arm(self._caster, data)
-        dark = near[self._caster.shaded(data, self._lamp, behind.spots[near], ARM_GROUP)]
-        pixels[dark] = behind.shaded[dark]
-        visible, hits = self._see_arm(data, behind)
-        spots = behind.from_camera.origin + behind.from_camera.rays[visible] * hits.distance_m[:, None]
+        background = self._background = self._background or self._render_background(data)
+        pixels = background.lit.copy()
+        near = background.from_lamp.near_arm(self._caster, data)
+        shaded = near[self._caster.shaded(data, self._lamp, background.spots[near], ARM_GROUP)]
+        pixels[shaded] = background.shaded[shaded]
+        visible, hits = self._cast_at_arm(data, background)
+        spots = background.from_camera.origin + background.from_camera.rays[visible] * hits.distance_m[:, None]
         ambient, direct = self._light(data, spots, hits, ARM_GROUP)
         pixels[visible] = _as_bytes(ambient + direct)
         return pixels.reshape(self._height, self._width, 3)
 
     def silhouette(self, data: Any) -> Bool[np.ndarray, "height width"]:
         """Return which pixels of the image show the arm, the block or moving objects."""
-        behind = self._background = self._background or self._see_background(data)
-        shown = np.zeros(self._height * self._width, dtype=bool)
-        shown[self._see_arm(data, behind)[0]] = True
-        return shown.reshape(self._height, self._width)
+        background = self._background = self._background or self._render_background(data)
+        is_visible = np.zeros(self._height * self._width, dtype=bool)
+        is_visible[self._cast_at_arm(data, background)[0]] = True
+        return is_visible.reshape(self._height, self._width)
 
-    def _see_arm(self, data: Any, behind: _Background) -> tuple[Int[np.ndarray, " visible"], Hits]:
+    def _cast_at_arm(self, data: Any, background: _Background) -> tuple[Int[np.ndarray, " visible"], Hits]:
         """Return the pixels that show the arm, the block or moving objects, and the hits of their rays."""
-        view = behind.from_camera
+        view = background.from_camera
         near = view.near_arm(self._caster, data)
         hits = self._caster.cast(data, view.origin, view.rays[near], ARM_GROUP)
-        front = np.flatnonzero((hits.geoms >= 0) & (hits.distance_m < behind.distance_m[near]))
+        front = np.flatnonzero((hits.geoms >= 0) & (hits.distance_m < background.distance_m[near]))
         return near[front], Hits(*(part[front] for part in hits))
 
-    def _see_background(self, data: Any) -> _Background:
+    def _render_background(self, data: Any) -> _Background:
         size = (self._width, self._height)
-        across, down = (
+        across, down = (  # slopes of the rays through the centre of each pixel
             ((np.arange(count) + 0.5) / count * 2 - 1) * half for count, half in zip(size, self._half_view, strict=True)
-        )  # through the centre of each pixel
+        )
         rays = np.stack(np.broadcast_arrays(across[None, :], down[:, None], 1.0), axis=-1).reshape(-1, 3)
         rays = unit(rays) @ self._pose[:3, :3].T
         view = View(self._pose, rays, self._half_view, size)
@@ -202,14 +204,14 @@ class RayCamera:
         return _Background(lit, shaded, distance, spots, view, from_lamp)
 
     def _light(self, data: Any, spots: Any, hits: Hits, group: int) -> tuple[Any, Any]:
-        """Return the colours of points from ambient light and from the lamp; the group casts shadows on itself."""
+        """Return the colours of points from ambient light and from the lamp; only geoms of the group cast shadows."""
         colour = self._colours.at(hits.geoms, spots)
         to_lamp = unit(self._lamp - spots)
-        shine = np.einsum("ij,ij->i", hits.normals, to_lamp).clip(0.0, 1.0)
-        facing = np.flatnonzero(shine > 0.0)
-        shine[facing[self._caster.shaded(data, self._lamp, spots[facing], group)]] *= _SHADOW
+        direct = np.einsum("ij,ij->i", hits.normals, to_lamp).clip(0.0, 1.0)
+        facing = np.flatnonzero(direct > 0.0)
+        direct[facing[self._caster.shaded(data, self._lamp, spots[facing], group)]] *= _SHADOW
         sky = 0.8 + 0.2 * hits.normals[:, 2:]
-        return colour * (self._ambient * sky), colour * ((1.15 - self._ambient) * shine[:, None])
+        return colour * (self._ambient * sky), colour * ((1.15 - self._ambient) * direct[:, None])
 
 
 class _Colours:

@@ -28,11 +28,9 @@ from vjepa2_ac.storage.paths import SIMULATION_FILE
 RECORDED_CAMERAS = {"exterior_1_left": "exterior_1", "exterior_2_left": "exterior_2", "wrist_left": "wrist"}
 """Camera of a data set, as in `data.fields.cameras` -> camera of the simulated arm."""
 
-_NUM_ARMS = 4  # cached resimulations of `explore`, each from another start
-_STATE_TOLERANCE = (
-    1e-5  # metres, radians, closedness; recorded states are float32, and library versions round differently
-)
-
+_CACHE_SIZE = 4  # number of cached resimulations of `explore`, each with another start
+# Metres, radians, closedness. Recorded states are float32, and library versions round differently.
+_STATE_TOLERANCE = 1e-5
 
 Actions = tuple[tuple[float, ...], ...]
 
@@ -56,7 +54,7 @@ class Resimulation:
     start: int  # control step
     camera: str  # camera of the simulated arm
     arm: SimulatedArm
-    done: Actions | None = None  # actions from the start to the arm's current state; None: the arm is in another state
+    executed: Actions | None = None  # actions from the start to the arm's current state; None: the state is unknown
 
     def simulate(self, actions: Float[np.ndarray, "steps 7"], stride: int) -> Outcome:
         """Carry out actions from the start, each relative to the measured state, and return the outcome.
@@ -66,7 +64,7 @@ class Resimulation:
             stride: Control steps per model step.
         """
         arm = self.arm
-        self.done = None
+        self.executed = None
         execute_episode(arm, self.number, self.spec, until=self.start)
 
         def observe() -> tuple[Any, ...]:
@@ -109,17 +107,17 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
     if episode.states.shape != (steps, 7):
         shape, needed = "x".join(map(str, episode.states.shape)), f"{steps}x7, as simulated: data.states: pose"
         raise InputError(where=where, found=f"states of {shape} numbers", needed=needed)
-    eye = (
-        RECORDED_CAMERAS[camera] if simulation.cameras == 3 else "exterior_1"
-    )  # a recording with one camera repeats its image
-    again = Resimulation(simulation, number, start, eye, make_arm(number, simulation))
-    off = np.abs(again.simulate(np.zeros((0, 7)), 1).states[0] - np.asarray(episode.states[start], dtype=np.float64))
-    off[3:6] = np.minimum(off[3:6], np.abs(2 * np.pi - off[3:6]))  # -pi and pi are the same angle
-    if off.max() > _STATE_TOLERANCE:
-        problem = f"simulated again, the state differs by up to {off.max():.2g}"
-        fix = f"Record it again with these versions of the libraries: {SIMULATION_FILE} names those that recorded it"
-        raise InputError(where=f"{where}: control step {start}", found=problem, needed="what was recorded", fix=fix)
-    return again
+    # A recording with fewer cameras repeats the image of the first camera.
+    arm_camera = RECORDED_CAMERAS[camera] if simulation.cameras == 3 else "exterior_1"
+    resimulation = Resimulation(simulation, number, start, arm_camera, make_arm(number, simulation))
+    state = resimulation.simulate(np.zeros((0, 7)), 1).states[0]
+    difference = np.abs(state - np.asarray(episode.states[start], dtype=np.float64))
+    difference[3:6] = np.minimum(difference[3:6], np.abs(2 * np.pi - difference[3:6]))  # -pi and pi are the same angle
+    if difference.max() > _STATE_TOLERANCE:
+        problem = f"the resimulated state differs by up to {difference.max():.2g}"
+        fix = f"Install the library versions that {SIMULATION_FILE} names, or record the data set again"
+        raise InputError(where=f"{where}: control step {start}", found=problem, needed="the recorded state", fix=fix)
+    return resimulation
 
 
 def simulated_outcome(dataset: Dataset, episode: int, start: int) -> Callable[[np.ndarray], tuple[Any, Any]] | None:
@@ -132,7 +130,7 @@ def simulated_outcome(dataset: Dataset, episode: int, start: int) -> Callable[[n
     """
     if not Path(dataset.config.path, SIMULATION_FILE).is_file():
         return None
-    arm = _of_dataset(dataset, episode, start)
+    arm = _resimulate_dataset(dataset, episode, start)
 
     def outcome(actions: np.ndarray) -> tuple[Any, Any]:
         simulated = arm.simulate(actions, dataset.config.model_stride)
@@ -141,7 +139,7 @@ def simulated_outcome(dataset: Dataset, episode: int, start: int) -> Callable[[n
     return outcome
 
 
-def _of_dataset(dataset: Dataset, episode: int, start: int) -> Resimulation:
+def _resimulate_dataset(dataset: Dataset, episode: int, start: int) -> Resimulation:
     path, camera = dataset.config.path, dataset.config.cameras[0]
     return resimulate(path, dataset.source.read(episode, camera), start, camera)
 
@@ -155,7 +153,7 @@ class SimulatedFutures:
 
     def __init__(self, dataset: Dataset) -> None:
         self._stride = dataset.config.model_stride
-        self._resimulated = lru_cache(maxsize=_NUM_ARMS)(partial(_of_dataset, dataset))
+        self._resimulated = lru_cache(maxsize=_CACHE_SIZE)(partial(_resimulate_dataset, dataset))
 
     @classmethod
     def of(cls, dataset: Dataset) -> SimulatedFutures | None:
@@ -174,17 +172,17 @@ class SimulatedFutures:
             cancelled: Called before each action; returns whether to cancel.
 
         Raises:
-            SearchCancelledError: It was cancelled.
+            SearchCancelledError: `cancelled` returned True.
         """
         simulation = self._resimulated(episode, step)
-        is_next, simulation.done = bool(actions) and simulation.done == actions[:-1], None
+        is_next, simulation.executed = bool(actions) and simulation.executed == actions[:-1], None
         if not is_next:
             execute_episode(simulation.arm, simulation.number, simulation.spec, until=step)
-        reached = True
+        is_reached = True
         for action in actions[-1:] if is_next else actions:
             if cancelled():
                 raise SearchCancelledError
-            reached = send_action(simulation.arm, np.array(action), self._stride)
-        simulation.done = actions
-        image = encode_jpeg(simulation.arm.image(simulation.camera), quality=JPEG_QUALITY)  # as those of the data set
-        return decode_images([image], [0], "a simulated frame")[0], simulation.arm.state, reached
+            is_reached = send_action(simulation.arm, np.array(action), self._stride)
+        simulation.executed = actions
+        image = encode_jpeg(simulation.arm.image(simulation.camera), quality=JPEG_QUALITY)  # as in the data set
+        return decode_images([image], [0], "a simulated frame")[0], simulation.arm.state, is_reached

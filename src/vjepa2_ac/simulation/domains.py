@@ -77,9 +77,9 @@ class Domain:
 
     def base_pose(self) -> Float[np.ndarray, "4 4"]:
         """Return the robot base frame in the world."""
-        pose = np.eye(4)
-        from scipy.spatial.transform import Rotation  # late, so that the names of domains need no SciPy
+        from scipy.spatial.transform import Rotation  # imported late, because the names of domains need no SciPy
 
+        pose = np.eye(4)
         pose[:3, :3] = Rotation.from_euler("z", self.base_yaw_deg, degrees=True).as_matrix()
         return pose
 
@@ -210,14 +210,7 @@ SUBSTEPS = 32  # physics steps per control step
 MOVING = "moving"  # prefix of the names of moving bodies
 
 _SCENE = "assets/simulation/arm.xml"
-_COLOURED = (
-    "arm",
-    "joints",
-    "hand",
-    "table",
-    "floor",
-    "wall",
-)  # classes of geoms, which are also fields of `Appearance`
+_COLOURED = ("arm", "joints", "hand", "table", "floor", "wall")  # classes of geoms and fields of `Appearance`
 
 
 def load_mujoco() -> Any:
@@ -272,11 +265,12 @@ def _clutter(rng: np.random.Generator, *, avoid_work_area: bool) -> Iterator[dic
         x, y = rng.uniform(0.25, 0.8), rng.uniform(-0.5, 0.5)
         size, height = rng.uniform(0.02, 0.04), rng.uniform(0.02, 0.05)
         colour, turn = rng.uniform(0.15, 0.9, size=3), rng.uniform(0, np.pi)
-        if avoid_work_area and all(low <= at <= high for at, (low, high) in zip((x, y), WORK_AREA_M, strict=True)):
+        ranges = zip((x, y), WORK_AREA_M, strict=True)
+        if avoid_work_area and all(low <= coordinate <= high for coordinate, (low, high) in ranges):
             continue
         kind, half = ("box", (size, size, height)) if index % 2 else ("cylinder", (size, height))
-        place = {"pos": _text(x, y, height), "size": _text(*half), "euler": _text(0.0, 0.0, turn)}
-        yield {"class": "static", "type": kind, "rgba": _text(*colour, 1.0), **place}
+        pose = {"pos": _text(x, y, height), "size": _text(*half), "euler": _text(0.0, 0.0, turn)}
+        yield {"class": "static", "type": kind, "rgba": _text(*colour, 1.0), **pose}
 
 
 def _text(*numbers: float) -> str:

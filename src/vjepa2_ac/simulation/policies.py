@@ -16,7 +16,7 @@ from vjepa2_ac.simulation.rollout import Action, Image, Observation, Trial, set_
 from vjepa2_ac.simulation.tasks import GRASP_M, RELEASED, TaskName, TaskProblem, make_problem
 from vjepa2_ac.spaces import apply_action
 
-_ALMOST = 1 - 1e-9  # factor that keeps actions within a limit despite rounding
+_ROUNDING_MARGIN = 1 - 1e-9  # factor that keeps actions within a limit despite rounding
 
 
 class ZeroActions:
@@ -80,7 +80,7 @@ class Oracle(ZeroActions):
             ValueError: The trial belongs to another environment than the simulated arm.
         """
         if trial.problem is None:
-            raise ValueError(f"trial {trial.seed} is none of the simulated arm: use Expert")
+            raise ValueError(f"trial {trial.seed} has no problem of the simulated arm. Use the policy Expert")
         self._problem = trial.problem
 
     def _change(self, observation: Observation) -> State:
@@ -118,7 +118,7 @@ def shorten_to_limits(change: Float[np.ndarray, " 7"], limits: LimitsConfig) -> 
     change = np.where(reach > 0, change, 0.0)
     for part in (slice(0, 3), slice(3, 6), slice(6, 7)):
         beyond = np.abs(change[part]) / np.where(reach[part] > 0, reach[part], 1.0)
-        change[part] *= min(1.0, _ALMOST / max(float(beyond.max()), 1e-12))
+        change[part] *= min(1.0, _ROUNDING_MARGIN / max(float(beyond.max()), 1e-12))
     return change
 
 

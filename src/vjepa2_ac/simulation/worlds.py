@@ -116,7 +116,7 @@ class EnvironmentProcess(ExitStack):
         try:
             answer = json.loads(line)
         except (ValueError, RecursionError):
-            raise self.error(f"the program wrote {_shown(line)}", "one JSON object per line") from None
+            raise self.error(f"the program wrote {_quote(line)}", "one JSON object per line") from None
         if not isinstance(answer, dict) or "error" in answer:
             raise self.error(str(answer["error"] if isinstance(answer, dict) else answer))
         return answer
@@ -132,7 +132,7 @@ class EnvironmentProcess(ExitStack):
     def _send(self, line: bytes) -> None:
         if self._poll.poll(0) and (unrequested := os.read(self._output, _MAX_SHOWN_BYTES)):
             raise self.error(
-                f"the program wrote {_shown(unrequested)} without a request", "exactly one answer to each request"
+                f"the program wrote {_quote(unrequested)} without a request", "exactly one answer to each request"
             )
         with suppress(BrokenPipeError):  # the program has exited, which `_read_line` reports
             if self._process.stdin.write(line) is None:  # lines below PIPE_BUF are written completely or not at all
@@ -161,7 +161,7 @@ class EnvironmentProcess(ExitStack):
                 raise self.error(f"a line of more than {_MAX_LINE_BYTES >> 20} MiB", "one JSON object per line")
         line, _, rest = b"".join(parts).partition(b"\n")
         if rest:
-            raise self.error(f"the program wrote {_shown(rest)} after its answer", "exactly one answer to each request")
+            raise self.error(f"the program wrote {_quote(rest)} after its answer", "exactly one answer to each request")
         return line
 
     def _error_with_output(self, problem: str, fix: str = PROTOCOL) -> InputError:
@@ -183,7 +183,7 @@ class EnvironmentProcess(ExitStack):
         self._reader.join(1.0)
 
 
-def _shown(line: bytes) -> str:
+def _quote(line: bytes) -> str:
     return repr(line[:_MAX_SHOWN_BYTES].decode(errors="replace").strip())
 
 
