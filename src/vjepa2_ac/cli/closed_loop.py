@@ -24,10 +24,13 @@ if TYPE_CHECKING:
     from vjepa2_ac.evaluation.summary import Summary, Verdict
     from vjepa2_ac.serving.metadata import NamedGoals
     from vjepa2_ac.serving.session import Session
-    from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
+    from vjepa2_ac.runs.subject import Subject
+    from vjepa2_ac.simulation.benchmark import BenchmarkOptions, ClosedLoopBenchmark
+    from vjepa2_ac.simulation.manifest import Manifest
 
 _OF_RECORD = ("cameras", "workers")
-_OF_A_MODEL = ("sub_goals", "films", "checkpoint", "config", "out")
+_OF_A_MANIFEST = ("task", "domain", "episodes", "steps", "seed", "sub_goals")
+_OF_A_MODEL = ("sub_goals", "manifest", "films", "checkpoint", "config", "out")
 
 
 def add_serve(commands: cli.Commands) -> None:
@@ -97,6 +100,8 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add(group, "--config CONFIG", "for a model: the config whose `planning` is used", cli.as_local)
     text = "sub-goals from the oracle's solution: its key frames, or every model step (none)"
     cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
+    text = "problems, steps and planning settings of a table: read from this file, or written to it if it is new"
+    cli.add(group, "--manifest FILE", text, cli.as_path)
     cli.add(group, "--films N", "episodes in the video; 0: none (6)", cli.whole_number(0))
     cli.add(group, "--out FOLDER", "output folder (closed_loop/TASK-DOMAIN in the run's folder)", cli.as_path)
     group = parser.add_argument_group("to record data")
@@ -181,6 +186,7 @@ def _simulate(options: argparse.Namespace) -> int:
     """
     if options.world is not None:
         _refuse(options, ("task", "domain"), needed="none: the world has its own")
+        _refuse(options, ("manifest",), needed="the simulated arm: --seed determines the problems of a world")
     elif options.world_timeout is not None:
         raise InputError(where="--world-timeout", found="no --world", needed="the program that it applies to")
     if options.subject == "record":
@@ -229,13 +235,14 @@ def _record_world(options: argparse.Namespace, target: Path) -> int:
 
 
 def _run_benchmark(options: argparse.Namespace) -> int:
+    manifest = _read_manifest(options)
     _require_benchmark(options)
 
     from vjepa2_ac.cli.tables import benchmark_notes, benchmark_table
     from vjepa2_ac.evaluation.summary import closed_loop_verdict
     from vjepa2_ac.simulation.benchmark import write_benchmark
 
-    benchmark, folder = _measure(options)
+    benchmark, folder = _measure(options, manifest)
     verdict = closed_loop_verdict(
         {result.policy: result.success_rate for result in benchmark.results},
         model=benchmark.results[0].policy,
@@ -266,14 +273,17 @@ def _require_benchmark(options: argparse.Namespace) -> None:
     cli.require_to_plan(options)
 
 
-def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
+def _measure(options: argparse.Namespace, manifest: Manifest | None) -> tuple[ClosedLoopBenchmark, Path]:
     """Run the closed-loop benchmark; return its result and the folder for its files."""
     from vjepa2_ac.simulation.benchmark import BenchmarkOptions, require_measured_inputs, run_benchmark
     from vjepa2_ac.simulation.domains import load_mujoco
     from vjepa2_ac.simulation.worlds import ExternalEnvironment, run_world_benchmark
 
     chosen = cli.record_of_options(BenchmarkOptions, options)
-    chosen, name = replace(chosen, films=min(chosen.films, chosen.episodes)), f"{chosen.task}-{chosen.domain}"
+    chosen = replace(chosen, films=min(chosen.films, chosen.episodes))
+    if manifest is not None:
+        chosen = manifest.options(chosen.films)
+    name = f"{chosen.task}-{chosen.world.name}"
     with contextlib.ExitStack() as stack:
         if options.world is None:
             load_mujoco()
@@ -285,9 +295,42 @@ def _measure(options: argparse.Namespace) -> tuple[ClosedLoopBenchmark, Path]:
         home = Path(options.subject) if is_run(options.subject) else Path()
         folder = options.out or home / "closed_loop" / name
         cli.make_folder(folder)
-        if options.world is None:
-            return run_benchmark(subject, chosen, reporter), folder
-        return run_world_benchmark(subject, env, chosen, reporter), folder
+        if options.world is not None:
+            return run_world_benchmark(subject, env, chosen, reporter), folder
+        if manifest is not None:
+            manifest.require_stride(subject.config.data.model_stride)
+            subject = replace(subject, config=subject.config.model_copy(update={"seed": manifest.planning_seed}))
+        elif options.manifest is not None:
+            _write_manifest(options.manifest, chosen, subject)
+        return run_benchmark(subject, chosen, reporter), folder
+
+
+def _read_manifest(options: argparse.Namespace) -> Manifest | None:
+    """Return the manifest and add its settings to the overrides; None if `--manifest` is not set or names a new file.
+
+    Raises:
+        InputError: The file is not a manifest, or an option or override would change what the manifest determines.
+    """
+    if options.manifest is None or not options.manifest.exists():
+        return None
+    from vjepa2_ac.simulation.manifest import read_manifest
+
+    manifest = read_manifest(options.manifest)
+    words = [f"--{name.replace('_', '-')}" for name in _OF_A_MANIFEST if getattr(options, name) is not None]
+    keys = {f"planning.{key}" for key in manifest.planning}
+    words += [word for word in options.overrides if ".".join(word.partition("=")[0].split(".")[:2]) in keys]
+    if words:
+        problem, fix = "a setting that the manifest determines", f"Leave out {words[0]}, or write a new manifest"
+        raise InputError(where=f"{words[0]} with --manifest", found=problem, fix=fix)
+    options.overrides = [*options.overrides, *manifest.overrides]
+    return manifest
+
+
+def _write_manifest(path: Path, chosen: BenchmarkOptions, subject: Subject) -> None:
+    from vjepa2_ac.simulation.manifest import Manifest
+
+    Manifest.of(chosen, subject).write(path)
+    cli.show(f"Manifest: {path}. Others repeat this measurement with --manifest {path}")
 
 
 def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse.Namespace) -> Summary:

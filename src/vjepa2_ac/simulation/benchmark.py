@@ -51,7 +51,7 @@ from vjepa2_ac.simulation.rollout import (
     run_trial,
     run_trials,
 )
-from vjepa2_ac.simulation.tasks import STEPS, SUCCESS_M, TaskName, arm_for, make_problem
+from vjepa2_ac.simulation.tasks import STEPS, SUCCESS_M, TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 from vjepa2_ac.storage.structured import utc_now
@@ -161,6 +161,7 @@ class BenchmarkOptions:
     stride: int = 4  # control steps (15 per second) per model step; a benchmark uses the model's stride
     films: int = 6  # number of first episodes whose frames are stored for a video; 0: no video
     sub_goals: SubGoals = "none"  # sub-goals of the model, from key frames or all steps of the oracle's solution
+    problems: tuple[TaskProblem, ...] | None = None  # the problems of a manifest; None: drawn from the seed
 
     @property
     def world(self) -> Domain:
@@ -178,9 +179,10 @@ class BenchmarkOptions:
             InputError: There is no domain with this name.
         """
         task, domain, steps = self.task, self.world, self.steps or STEPS[self.task]
-        problems = (make_problem(task, domain, self.seed, index) for index in range(self.episodes))
+        drawn = (make_problem(task, domain, self.seed, index) for index in range(self.episodes))
+        problems = drawn if self.problems is None else self.problems
         about = {
-            **{key: value for key, value in vars(self).items() if key != "films"},
+            **{key: value for key, value in vars(self).items() if key not in {"films", "problems"}},
             "domain": domain.name,
             "steps": steps,
             "seconds_per_step": self.stride / CONTROL_RATE_HZ,
