@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from typing import Any
 
     from vjepa2_ac.evaluation.summary import Summary, Verdict
+    from vjepa2_ac.runs.subject import Subject
     from vjepa2_ac.serving.metadata import NamedGoals
     from vjepa2_ac.serving.session import Session
-    from vjepa2_ac.runs.subject import Subject
     from vjepa2_ac.simulation.benchmark import BenchmarkOptions, ClosedLoopBenchmark
     from vjepa2_ac.simulation.manifest import Manifest
 

@@ -1,4 +1,4 @@
-"""Problem manifests: everything that determines a closed-loop measurement, in a file with which others can repeat it."""
+"""Problem manifests: a file with everything that determines a closed-loop measurement, so that others can repeat it."""
 
 from __future__ import annotations
 
