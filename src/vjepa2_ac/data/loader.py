@@ -72,11 +72,11 @@ SINGLE_PROCESS = ProcessShare()
 
 @dataclass(frozen=True)
 class MixedDataset:
-    """A data set, and optionally a second one that provides a share of the training clips (replay)."""
+    """A data set, and optionally a second data set that provides a fraction of the training clips (replay)."""
 
     dataset: Dataset
     replayed: Dataset | None = None
-    share: float = 0.0  # fraction of the clips that are from `replayed`
+    replay_share: float = 0.0  # fraction of the clips that are from `replayed`
 
 
 def training_loader(
@@ -95,8 +95,8 @@ def training_loader(
     `data.broken_episodes` is skip, clips that cannot be read are missing from their micro-batch, which may be empty;
     no other clip replaces them.
 
-    With a second data set, each data set has a separate sequence. With the fraction f = `MixedDataset.share`, clip p of
-    the run is clip floor(p * f) of the second data set if floor((p + 1) * f) is larger than floor(p * f). The fraction
+    With a second data set, each data set has a separate sequence. With the fraction f = `MixedDataset.replay_share`, clip p
+    of the run is clip floor(p * f) of the second data set if floor((p + 1) * f) is larger than floor(p * f). The fraction
     is therefore exact, up to one clip, in every part of the run.
 
     Pinned batches are in page-locked memory, from which copies to a CUDA device do not block the host.
@@ -108,7 +108,7 @@ def training_loader(
     dataset, replayed = mixed.dataset, mixed.replayed
     clips = _training_clips(dataset, seed)
     if replayed is not None:
-        clips = replace(clips, replayed=_training_clips(replayed, seed), share=Fraction(str(mixed.share)))
+        clips = replace(clips, replayed=_training_clips(replayed, seed), replay_share=Fraction(str(mixed.replay_share)))
     firsts = first_positions(share, batch_size, start=start_position)
     positions = (list(range(first, first + batch_size)) for first in firsts)
     micro_batches = map_in_workers(clips, positions, dataset.config.workers, pinned=pinned)
@@ -192,7 +192,7 @@ class _MicroBatches(TorchDataset[Batch]):
     request_at: Callable[[int], ClipRequest]  # a pure function of the position, the same in every worker
     transforms: ClipTransforms | None = None  # of training clips; also pure functions of the position
     replayed: _MicroBatches | None = None  # clips of the second data set
-    share: Fraction = Fraction(0)  # share of clips from the second data set
+    replay_share: Fraction = Fraction(0)  # fraction of clips from the second data set
 
     def __getitems__(self, positions: list[int]) -> Batch | UserError:
         """Return a micro-batch, or the error of reading it, because DataLoader would change the type of a raised error.
@@ -218,7 +218,7 @@ class _MicroBatches(TorchDataset[Batch]):
 
     def _read_clip(self, position: int) -> Clip | SkippedClip:
         if self.replayed is not None:
-            num_replayed_before, num_replayed = (int(count * self.share) for count in (position, position + 1))
+            num_replayed_before, num_replayed = (int(count * self.replay_share) for count in (position, position + 1))
             if num_replayed > num_replayed_before:
                 clip = self.replayed._read_clip(num_replayed_before)
                 return replace(clip, replayed=True) if isinstance(clip, SkippedClip) else clip
@@ -401,7 +401,7 @@ def _end_without_sending(error: BaseException, _batch: object) -> None:
 
 
 def require_shared_memory(data: DataConfig, batch_bytes: float, processes: int = 1) -> None:
-    """Refuse a shared memory that is too small for the prefetched batches; in containers it has 64 MB by default.
+    """Check that shared memory has space for the prefetched batches of all workers; containers have 64 MB by default.
 
     Args:
         data: The config, which has the number of workers.

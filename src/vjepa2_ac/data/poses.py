@@ -132,7 +132,7 @@ def require_selection(
 
 def _require_unit_quaternions(quaternions: Float[np.ndarray, "steps 4"], where: str, fix: str) -> None:
     lengths = np.linalg.norm(quaternions, axis=1)
-    is_wrong = ~(abs(lengths - 1) <= _UNIT_TOLERANCE)  # ~(<=) is also true for NaN
+    is_wrong = ~(abs(lengths - 1) <= _UNIT_TOLERANCE)  # also true for NaN
     if is_wrong.any():
         step = int(is_wrong.argmax())
         problem = f"the quaternion {np.array2string(quaternions[step], precision=4)} of length {lengths[step]:.4g}"
@@ -156,7 +156,7 @@ class RotationSpeeds:
 
     @property
     def num_smooth_jumps(self) -> int:
-        """The number of jumps at which the hand turns about as fast as at the steps around, as expected."""
+        """The number of jumps at which the hand turns about as fast as at the steps around, as in the right format."""
         return int((self.at_jumps <= _SMOOTH).sum())
 
     def num_smoother_than(self, other: RotationSpeeds) -> int:

@@ -87,6 +87,7 @@ def require_distinct(table: EpisodeTable, is_selected: Bool[np.ndarray, " episod
         if name in indices:
             problem = f"episodes {indices[name]} and {index} have the same identity: {name}"
             error = InputError(where=f"data.path: {config.path}", found=problem, fix=config.same_identity_fix)
+            # If all episodes have this identity, excluding it would leave no episode.
             raise add_exclusion_fix(error, [name]) if hashes.size > 1 else error
         indices[name] = index
 

@@ -140,9 +140,7 @@ def test_state_formats_are_proposed_and_read(
     if "bool" in str(kinds):
         closed = open_source(config).read(0).states[:, 6]
         assert np.array_equal(closed, TRUE[0][:, 6] > 0.5)
-    elif (
-        "gripper_closed" in expected or "select" in expected
-    ):  # the width of the open gripper is only known from the recordings
+    elif "gripper_closed" in expected or "select" in expected:  # the open gripper's width is estimated from the data
         closed, true = open_source(config).read(0).states[:, 6], TRUE[0][:, 6]
         assert np.corrcoef(closed, true)[0, 1] > 0.999
     else:

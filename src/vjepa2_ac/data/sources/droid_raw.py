@@ -64,7 +64,8 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
     (`get_identity`). The numbers of a trajectory and the times of a video's frames are stored in the disk cache, so
     that each machine parses the HDF5 file and reads the packets of a video with B-frames only once.
 
-    An MP4 has one frame per control step, in order, regardless of the rate in its header. Only the last may be missing.
+    An MP4 has one frame per control step, in order; only the last frame may be missing. The rate in its header is not
+    used.
     """
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - a video is fetched in blocks

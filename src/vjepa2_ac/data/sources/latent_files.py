@@ -241,7 +241,7 @@ def _file_name(number: int, camera: str, ending: str = _LATENTS_SUFFIX) -> str:
 
 
 class EpisodeFile:
-    """An open file of latents. Content is read on request; only the requested latents and images are read.
+    """An open file of latents, of which only the requested frames are read.
 
     The safetensors format is parsed here, because the library cannot read parts of remote files.
 
