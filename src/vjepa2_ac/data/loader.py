@@ -95,9 +95,9 @@ def training_loader(
     `data.broken_episodes` is skip, clips that cannot be read are missing from their micro-batch, which may be empty;
     no other clip replaces them.
 
-    With a second data set, each data set has a separate sequence. With the fraction f = `MixedDataset.replay_share`, clip p
-    of the run is clip floor(p * f) of the second data set if floor((p + 1) * f) is larger than floor(p * f). The fraction
-    is therefore exact, up to one clip, in every part of the run.
+    With a second data set, each data set has a separate sequence. With the fraction f = `MixedDataset.replay_share`,
+    clip p of the run is clip floor(p * f) of the second data set if floor((p + 1) * f) is larger than floor(p * f). The
+    fraction is therefore exact, up to one clip, in every part of the run.
 
     Pinned batches are in page-locked memory, from which copies to a CUDA device do not block the host.
 
