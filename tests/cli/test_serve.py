@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from served import STATE, ended, image, started
+from served import STATE, image, start_server, stop_server
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.errors import UnreachableError
@@ -33,7 +33,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_serve_replies_to_a_robot_and_records_every_decision(workshop: Path, tmp_path: Path) -> None:
     record = tmp_path / "record"
     arguments = [str(workshop / "model"), "--goals", str(workshop / "goals"), "--key-file", str(workshop / "key")]
-    process, url = started(*arguments, "--record", str(record), *QUICK)
+    process, url = start_server(*arguments, "--record", str(record), *QUICK)
     with pytest.raises(UnreachableError, match="401"):
         PlanningClient(url)
     replies = []
@@ -44,14 +44,14 @@ def test_serve_replies_to_a_robot_and_records_every_decision(workshop: Path, tmp
         for step in range(3):
             message = {"observation/image": image(step), "observation/state": STATE + 0.01 * step, "prompt": "cup"}
             replies.append(client.infer(message))
-    assert "robot disconnected" in ended(process)
+    assert "robot disconnected" in stop_server(process)
     lines = [json.loads(line) for line in (record / "decisions.jsonl").read_text().splitlines()]
     assert [line["answer"]["actions"] for line in lines] == [reply["actions"].tolist() for reply in replies]
 
 
 def test_dry_run_with_poses_replies_to_roboarena_messages(workshop: Path) -> None:
     arguments = ["--dry-run", "--actions", "pose", *QUICK, "data.stride=5"]
-    process, url = started(str(workshop / "model"), *arguments)
+    process, url = start_server(str(workshop / "model"), *arguments)
     with PlanningClient(url) as client:
         assert client.metadata["action_space"] == "cartesian_position"
         reply = client.infer({
@@ -61,7 +61,7 @@ def test_dry_run_with_poses_replies_to_roboarena_messages(workshop: Path) -> Non
         })  # fmt: skip
         np.testing.assert_allclose(reply["actions"], np.tile(STATE, (5, 1)), atol=1e-9)
         assert client.infer({"endpoint": "reset", "session_id": "two"}) == {"status": "reset"}
-    assert "dry run: every action is zero" in ended(process)
+    assert "dry run: every action is zero" in stop_server(process)
 
 
 INVALID_OPTIONS = {

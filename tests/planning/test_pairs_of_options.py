@@ -87,8 +87,8 @@ REFUSED = {
 
 
 @dataclass
-class Scene:
-    """The files and objects that the tests of all pairs share."""
+class SharedFiles:
+    """The model and the files that the tests of all pairs share."""
 
     model: WorldModel
     files: dict[str, str]
@@ -125,7 +125,7 @@ def get_entries(name: str) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+def shared_files(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedFiles]:
     folder, model = tmp_path_factory.mktemp("files"), tiny_model(depth=1)
     fingerprints = model.merged_from = model.fingerprints()  # hashed once
     monitor = Monitor(
@@ -145,13 +145,13 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(compilation, "describe_missing_compiler", lambda _: None)
         with torch.compiler.set_stance("force_eager"):
-            yield Scene(model, {name: str(folder / file) for name, file in files.items()})
+            yield SharedFiles(model, {name: str(folder / file) for name, file in files.items()})
 
 
-def plan_with_options(scene: Scene, *names: str) -> None:
+def plan_with_options(shared_files: SharedFiles, *names: str) -> None:
     """Make two decisions with some options, and run `plan` and `score`."""
-    config = scene.config(*names)
-    planning, controller = config.planning, Controller.of_subject(Subject("tiny", config, scene.model))
+    config = shared_files.config(*names)
+    planning, controller = config.planning, Controller.of_subject(Subject("tiny", config, shared_files.model))
     images = [image(seed, SIDE, SIDE * planning.views) for seed in range(4)]
     goals, chunks = make_timed_goals(images[2:], (1,)), None
     mask = np.arange(SIDE * SIDE * planning.views).reshape(SIDE, -1) % 3 > 0 if "mask" in names else None
@@ -164,22 +164,22 @@ def plan_with_options(scene: Scene, *names: str) -> None:
         assert np.isfinite(decide(controller, PlanRequest(images[0], STATE, goals, mask), nodes=0).actions).all()
 
 
-def test_every_option_is_varied(scene: Scene) -> None:
+def test_every_option_is_varied(shared_files: SharedFiles) -> None:
     keys = {key.removeprefix("planning.") for key in collect_effects(Config) if key.startswith("planning.")}
     assert set(OTHERS) == keys, "add a value for the new key to OTHERS"
-    default_config = scene.config()
+    default_config = shared_files.config()
     for name in OTHERS:
-        assert scene.config(name) != default_config
+        assert shared_files.config(name) != default_config
 
 
-def test_every_pair_of_options_works_or_raises_before_the_first_decision(scene: Scene) -> None:
+def test_every_pair_of_options_works_or_raises_before_the_first_decision(shared_files: SharedFiles) -> None:
     refused, compatible = set(), {name: set[str]() for name in OTHERS | MORE}
     for one, other in combinations(OTHERS | MORE, 2):
         shared = get_entries(one).keys() & get_entries(other).keys()
         if any(get_entries(one)[key] != get_entries(other)[key] for key in shared):
             continue  # two values of one option
         try:
-            scene.config(one, other)
+            shared_files.config(one, other)
         except InputError:
             refused.add(frozenset({one, other}))
             continue
@@ -190,9 +190,9 @@ def test_every_pair_of_options_works_or_raises_before_the_first_decision(scene: 
     alone = [sorted(pair) for pair in pairs if pair & ALONE]
     for names in [*alone, *group_pairs([pair for pair in pairs if not pair & ALONE], compatible)]:
         try:
-            plan_with_options(scene, *names)
+            plan_with_options(shared_files, *names)
         except Exception as error:
-            raise AssertionError(f"{', '.join(names)}: {scene.planning(*names)}") from error
+            raise AssertionError(f"{', '.join(names)}: {shared_files.planning(*names)}") from error
 
 
 def group_pairs(pairs: list[frozenset[str]], compatible: dict[str, set[str]], at_most: int = 8) -> Iterator[list[str]]:

@@ -183,8 +183,8 @@ class _UnsafeController(Controller):
 
     planned_actions = np.zeros((2, 7))
 
-    def act(self, frame: np.ndarray, state: np.ndarray, **how: object) -> np.ndarray:
-        action = super().act(frame, state, **how)
+    def act(self, frame: np.ndarray, state: np.ndarray, **options: object) -> np.ndarray:
+        action = super().act(frame, state, **options)
         if self.decision.plan is not None:
             plan = replace(self.decision.plan, actions=torch.from_numpy(self.planned_actions))
             self.decision = replace(self.decision, plan=plan, action=self.planned_actions[0])
@@ -392,9 +392,9 @@ def test_cancelled_score_stops_after_the_current_batch(ended_by: str, monkeypatc
     batch_sizes: list[int] = []
     rollout = served.controller._model.rollout
 
-    def record_batch(frame: torch.Tensor, *more: object, **how: object) -> object:
+    def record_batch(frame: torch.Tensor, *more: object, **options: object) -> object:
         batch_sizes.append(len(frame))
-        return rollout(frame, *more, **how)
+        return rollout(frame, *more, **options)
 
     monkeypatch.setattr(served.controller._model, "rollout", record_batch)
     message = pack(request(1, **SCORE))

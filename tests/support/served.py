@@ -1,4 +1,4 @@
-"""A planning server in a thread of the test, the command in a process, and the small model behind them."""
+"""Planning servers with a tiny model, in a thread of the test or as a process of the command `serve`."""
 
 import asyncio
 import os
@@ -32,74 +32,77 @@ def request(seed: int = 0, **more: object) -> dict:
 
 
 class Running:
-    """A server that listens."""
+    """The addresses of a running server."""
 
     def __init__(self, url: str) -> None:
         self.url, self.http = url, url.replace("ws://", "http://")
 
 
 @contextmanager
-def in_a_thread(
+def run_in_thread(
     serve: Callable[[asyncio.Event, Callable[[str], None]], Awaitable[object]], until: str
 ) -> Iterator[list[str]]:
-    """Run a server as long as the context lasts; yield its status lines, once one starts with `until`."""
+    """Run a server during the `with` block; yield its status lines as soon as a line starts with `until`."""
     lines: list[str] = []
-    begun, of_loop, failed = threading.Event(), [], []
+    has_started, loop_and_stop, errors = threading.Event(), [], []
 
-    def tell(line: str) -> None:
+    def print_status(line: str) -> None:
         lines.append(line)
         if line.startswith(until):
-            begun.set()
+            has_started.set()
 
     async def run() -> None:
         stop = asyncio.Event()
-        of_loop.extend((asyncio.get_running_loop(), stop))
-        await serve(stop, tell)
+        loop_and_stop.extend((asyncio.get_running_loop(), stop))
+        await serve(stop, print_status)
 
-    def thread() -> None:
+    def run_and_store_errors() -> None:
         try:
             asyncio.run(run())
         except BaseException as error:
-            failed.append(error)
+            errors.append(error)
         finally:
-            begun.set()
+            has_started.set()
 
-    running = threading.Thread(target=thread)
-    running.start()
-    assert begun.wait(120)
-    if failed:
-        running.join()
-        raise failed[0]
+    thread = threading.Thread(target=run_and_store_errors)
+    thread.start()
+    assert has_started.wait(120)
+    if errors:
+        thread.join()
+        raise errors[0]
     try:
         yield lines
     finally:
-        of_loop[0].call_soon_threadsafe(of_loop[1].set)
-        running.join(120)
-        assert not running.is_alive()
+        loop, stop = loop_and_stop
+        loop.call_soon_threadsafe(stop.set)
+        thread.join(120)
+        assert not thread.is_alive()
 
 
 @contextmanager
 def serving(
     load: Callable[[], Session], access: Access | None = None, metadata: dict | None = None
 ) -> Iterator[Running]:
-    """Serve robots as long as the context lasts."""
+    """Run a planning server during the `with` block."""
 
-    def serve(stop: asyncio.Event, tell: Callable[[str], None]) -> Awaitable[object]:
-        return PlanningServer(access or Access("127.0.0.1"), 0, tell).run(lambda: (load(), metadata or {}), stop)
+    def serve(stop: asyncio.Event, print_status: Callable[[str], None]) -> Awaitable[object]:
+        return PlanningServer(access or Access("127.0.0.1"), 0, print_status).run(
+            lambda: (load(), metadata or {}), stop
+        )
 
-    with in_a_thread(serve, "listening on ") as lines:
+    with run_in_thread(serve, "listening on ") as lines:
         yield Running(lines[0].removeprefix("listening on "))
 
 
-def started(*words: str) -> tuple[Rank, str]:
-    """Start a server; return it and its address."""
-    process = Rank(["-m", "vjepa2_ac.cli", "serve", *words, "--port", "0"], dict(os.environ))
+def start_server(*arguments: str) -> tuple[Rank, str]:
+    """Start the command `serve`; return its process and its address."""
+    process = Rank(["-m", "vjepa2_ac.cli", "serve", *arguments, "--port", "0"], dict(os.environ))
     (address,) = wait_until(lambda: re.findall(r"^listening on (.+)\n", process.written()[0], re.MULTILINE), [process])
     return process, address
 
 
-def ended(process: Rank) -> str:
-    """End a server as its host does; return what it wrote."""
+def stop_server(process: Rank) -> str:
+    """Stop a server with SIGTERM; return its output."""
     process.send_signal(signal.SIGTERM)
     out, errors = process.communicate()
     assert process.returncode == 0, errors

@@ -6,21 +6,21 @@ from contextlib import contextmanager
 from typing import Any
 
 from browser import browser
-from served import in_a_thread
+from served import run_in_thread
 from vjepa2_ac.explore.server import ExploreServer
 from vjepa2_ac.explore.views import Views
 
 
 def header(message: Any) -> dict[str, Any]:
-    """Return the header of a message of the server."""
+    """Return the header of a message from the server."""
     content: dict[str, Any] = json.loads(message[4 : 4 + int.from_bytes(message[:4], "big")])
     return content
 
 
 @contextmanager
 def serving(views: Views, port: int = 0) -> Iterator[str]:
-    """Serve as long as the context lasts; yield the page's address."""
-    with in_a_thread(ExploreServer(views, port).run, "http") as lines:
+    """Run the server of the page during the `with` block; yield the URL of the page."""
+    with run_in_thread(ExploreServer(views, port).run, "http") as lines:
         yield lines[0]
 
 
