@@ -99,7 +99,7 @@ def export_run(
         destination = destination if destination.suffix == ".pt" else destination / OFFICIAL_NAME
         with translate_write_errors(destination), atomic_writer(destination) as file:
             write_torch(to_official(run.world_model), file)
-    return Exported(destination, run.chosen)
+    return Exported(destination, run.checkpoint_label)
 
 
 def _check_free(destination: Path, form: Form) -> None:

@@ -86,7 +86,7 @@ def test_closed_loop_summary_includes_an_evaluation_of_the_same_checkpoint_only(
         "vjepa2_ac.reports.metrics_json.read_metrics", lambda _: SimpleNamespace(about=about, summary=summary)
     )
     (tmp_path / METRICS_FILE).touch()
-    subject = SimpleNamespace(name=str(tmp_path), chosen="step-00000010 (as requested)")
+    subject = SimpleNamespace(name=str(tmp_path), checkpoint_label="step-00000010 (as requested)")
     trials = SimpleNamespace(task="reach", place="domain A", steps=20, seconds_per_step=0.25)
     options = parse(["simulate", str(tmp_path), "--task", "reach", "--domain", "A"])
     found = _summary(SimpleNamespace(subject=subject, trials=trials), verdict, options)

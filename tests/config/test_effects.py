@@ -60,7 +60,7 @@ NON_INDEX_KEYS = {"fields.language", "fields.joint_velocity", "fields.control_ra
 
 
 class LookedUp(Exception):  # noqa: N818 - it carries a value and is not an error
-    """Carries the key with which an index or idle ranges are looked up."""
+    """Raised instead of a look-up of an index or of idle ranges; carries the key."""
 
 
 def literal_values(annotation: Any) -> list[Any]:
@@ -108,7 +108,7 @@ def with_other_value(section: BaseModel, key: str, full_key: str, source: str) -
 
 
 @pytest.fixture(scope="module")
-def sets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def data_sets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     root = tmp_path_factory.mktemp("sets")
     return {name: write(root / name, [0, 1]) for name, write in WRITERS.items()}
 
@@ -126,8 +126,11 @@ def config_of(source: str, path: str | Path, run_dir: Path, **data: Any) -> Conf
 
 def config_keys(config: Config) -> set[str]:
     """Return the keys of a config with its data format."""
-    foreign = set(DataConfig.kinds.values()) - {type(config.data)}
-    names = ("replay.", *(f"data.{name}." for kind in foreign for name in kind.format_sections()))  # see test_replay.py
+    other_formats = set(DataConfig.kinds.values()) - {type(config.data)}
+    names = (
+        "replay.",
+        *(f"data.{name}." for kind in other_formats for name in kind.format_sections()),
+    )  # see test_replay.py
     return {key for key in collect_effects(Config) if not key.startswith(names)}
 
 
@@ -147,18 +150,18 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
         monkeypatch.setattr(f"vjepa2_ac.data.sources.{source}.get_or_build_index", stop)
     monkeypatch.setattr(idle_ranges, "get_or_build", stop)
 
-    def looked_up(action: Callable[[], Any]) -> Any:
+    def key_of_lookup(action: Callable[[], Any]) -> Any:
         with pytest.raises(LookedUp) as caught:
             action()
         return caught.value.args[0]
 
     def keys(config: Config) -> dict[str, str | None]:
         try:
-            index: str = looked_up(lambda: open_source(config.data).infos())
+            index: str = key_of_lookup(lambda: open_source(config.data).infos())
         except InputError:
             return dict.fromkeys(("index", "idle", "latents"))
         table = replace(EpisodeTable.from_infos([EpisodeInfo("one", 9, None)]), texts={"index": index})
-        ranges = looked_up(lambda: idle_ranges.find_ranges(open_source(config.data), table, config.data, None))
+        ranges = key_of_lookup(lambda: idle_ranges.find_ranges(open_source(config.data), table, config.data, None))
         latents = build_cache_key(config.data, index, get_encoding(world_model(), config))
         return {"index": index, "idle": ranges, "latents": latents.digest}
 
@@ -166,12 +169,12 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
 
 
 def test_config_key_without_affects_annotation_raises() -> None:
-    class Forgotten(Section):
+    class Unannotated(Section):
         batch: Annotated[int, Affects.RUN] = 1
         workers: int = 1
 
     with pytest.raises(TypeError, match=r"workers: not annotated with what it affects"):
-        values_that_affect(Affects.RUN, Forgotten())
+        values_that_affect(Affects.RUN, Unannotated())
 
 
 def test_options_of_a_plugin_data_format_change_the_cache_key(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,17 +197,21 @@ def test_options_of_a_plugin_data_format_change_the_cache_key(monkeypatch: pytes
 @pytest.mark.parametrize("states", ["pose", "vector"])
 @pytest.mark.parametrize("source", WRITERS)
 def test_changed_key_invalidates_exactly_what_it_affects(
-    source: str, states: str, sets: dict[str, Path], keys_of: Callable[[Config], dict[str, str | None]], tmp_path: Path
+    source: str,
+    states: str,
+    data_sets: dict[str, Path],
+    keys_of: Callable[[Config], dict[str, str | None]],
+    tmp_path: Path,
 ) -> None:
     if (source, states) == ("droid_raw", "vector"):
         pytest.skip("raw DROID has poses")
-    config = config_of(source, sets[source], tmp_path, **(vector_options(source) if states == "vector" else {}))
+    config = config_of(source, data_sets[source], tmp_path, **(vector_options(source) if states == "vector" else {}))
     old, format_keys = keys_of(config), tuple(f"data.{name}." for name in config.data.format_sections())
     assert None not in old.values()
     changed: dict[str, set[str]] = {}
     for key in config_keys(config) - {"data.source", "data.path"} - ONLY_REMOTE:
         new = keys_of(with_other_value(config, key, key, source))
-        if None not in new.values():  # the data set did not reject the value
+        if None not in new.values():  # no value was rejected
             changed[key] = {name for name in old if new[name] != old[name]}
     for key, names in changed.items():
         name, is_latents = key.removeprefix("data."), Affects.LATENTS in collect_effects(Config)[key]
@@ -219,10 +226,10 @@ def test_changed_key_invalidates_exactly_what_it_affects(
 
 @pytest.mark.parametrize("source", WRITERS)
 def test_moved_data_set_keeps_its_keys_and_a_changed_one_does_not(
-    source: str, sets: dict[str, Path], keys_of: Callable[[Config], dict[str, str | None]], tmp_path: Path
+    source: str, data_sets: dict[str, Path], keys_of: Callable[[Config], dict[str, str | None]], tmp_path: Path
 ) -> None:
-    shutil.copytree(sets[source], tmp_path / "moved", copy_function=shutil.copy2)
-    original, moved = (config_of(source, path, tmp_path) for path in (sets[source], tmp_path / "moved"))
+    shutil.copytree(data_sets[source], tmp_path / "moved", copy_function=shutil.copy2)
+    original, moved = (config_of(source, path, tmp_path) for path in (data_sets[source], tmp_path / "moved"))
     assert keys_of(moved) == keys_of(original)
     largest = max((tmp_path / "moved").rglob("*.*"), key=lambda path: path.stat().st_size)
     largest.touch()

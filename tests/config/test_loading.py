@@ -85,7 +85,7 @@ def test_camera_serial_number_is_read_as_text_with_and_without_quotes(tmp_path: 
 
 def test_option_names_that_yaml_reads_as_booleans_stay_text(tmp_path: Path) -> None:
     path, sections = write(tmp_path, yaml.safe_dump(MINIMAL)), config_schema()["$defs"]
-    checked = []
+    checked_keys = []
     for key in all_keys():
         outer, _, name = key.rpartition(".")
         properties = (section.get("properties", {}) for section in sections.values())
@@ -94,8 +94,8 @@ def test_option_names_that_yaml_reads_as_booleans_stay_text(tmp_path: Path) -> N
             if outer and yaml.safe_load(str(word)) != word:
                 required = ["replay.data.path=d"] * key.startswith("replay.")
                 assert attrgetter(key)(load_config(path, [f"{key}={word}", *required])) == word
-                checked.append(key)
-    assert {"data.cache", "training.compile", "planning.compile"} <= set(checked)
+                checked_keys.append(key)
+    assert {"data.cache", "training.compile", "planning.compile"} <= set(checked_keys)
 
 
 @pytest.mark.parametrize("text", ["", "- a list", "{unclosed", "run_dir: a\nrun_dir: b"])

@@ -39,7 +39,7 @@ def gpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None
     importlib.import_module("peft")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda *_, **__: True)  # it emulates
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda *_, **__: True)  # bfloat16 is emulated
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda *_: request.param)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda *_: "Tesla T4")
 
@@ -57,7 +57,7 @@ def parsed(**training: str) -> Config:
     return parse_config(values(**training), where="test")
 
 
-def through(command: str, monkeypatch: pytest.MonkeyPatch, folder: Path, **training: str) -> int:
+def run_command(command: str, monkeypatch: pytest.MonkeyPatch, folder: Path, **training: str) -> int:
     if command == "simulate" and importlib.util.find_spec("mujoco") is None:
         pytest.skip("MuJoCo (extra sim) is not installed")
     monkeypatch.chdir(folder)
@@ -73,12 +73,12 @@ def through(command: str, monkeypatch: pytest.MonkeyPatch, folder: Path, **train
 def test_emulated_bfloat16_raises(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert through(command, monkeypatch, tmp_path) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "Tesla T4 of compute capability 7.5" in said
-    assert "8.0 or more" in said
-    assert ("training.precision: bf16" in said) == (command in UNDER_AUTOCAST)
-    assert ("Set training.precision=fp16" if command in UNDER_AUTOCAST else "Set model.dtype=float32") in said
+    assert run_command(command, monkeypatch, tmp_path) == 2
+    message = " ".join(capsys.readouterr().err.split())
+    assert "Tesla T4 of compute capability 7.5" in message
+    assert "8.0 or more" in message
+    assert ("training.precision: bf16" in message) == (command in UNDER_AUTOCAST)
+    assert ("Set training.precision=fp16" if command in UNDER_AUTOCAST else "Set model.dtype=float32") in message
 
 
 @pytest.mark.usefixtures("gpu")
@@ -95,7 +95,7 @@ def test_slow_bfloat16_on_a_cpu_causes_a_warning_with_a_fix(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(distributed, "measure_matmul_speed", lambda _, dtype: 1e9 if dtype == torch.bfloat16 else 6e10)
     distributed._warn_if_slow.cache_clear()
-    through("train", monkeypatch, tmp_path)
+    run_command("train", monkeypatch, tmp_path)
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
     assert "60 times as long as in float32" in line
     assert line.endswith("Set training.precision=fp32 with model.dtype=float32")

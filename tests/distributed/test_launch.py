@@ -16,12 +16,14 @@ VARIABLES = {"RANK": "0", "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER
 def launched(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Return a function that sets launcher variables and replaces the rendezvous."""
 
-    def launched(variables: dict[str, str], meet: Any = None) -> None:
+    def launched(variables: dict[str, str], rendezvous: Any = None) -> None:
         for name in VARIABLES:
             monkeypatch.delenv(name, raising=False)
         for name, value in variables.items():
             monkeypatch.setenv(name, value)
-        monkeypatch.setattr(distributed, "rendezvous", meet or (lambda *_, **__: pytest.fail("met")))
+        monkeypatch.setattr(
+            distributed, "rendezvous", rendezvous or (lambda *_, **__: pytest.fail("rendezvous was called"))
+        )
         monkeypatch.setattr(distributed.torch.distributed, "init_process_group", lambda *_, **__: None)
 
     return launched
@@ -61,30 +63,30 @@ def test_missing_processes_are_reported_while_waiting(
 ) -> None:
     reported = threading.Event()
 
-    def meet(*_: object, **__: object) -> Any:
+    def rendezvous(*_: object, **__: object) -> Any:
         assert reported.wait(60)
         yield Store(), 0, 2
 
-    launched(VARIABLES | changes, meet)
+    launched(VARIABLES | changes, rendezvous)
     monkeypatch.setattr(distributed, "_REPORT_AFTER_S", 0.01)
     monkeypatch.setattr(distributed._log, "warning", lambda *words: (logging.warning(*words), reported.set()))
     distributed._join_process_group("gloo")
-    (said,) = caplog.messages
-    assert said.startswith(f"Waiting for {missing} at 127.0.0.1:29511. Unset RANK and WORLD_SIZE")
+    (message,) = caplog.messages
+    assert message.startswith(f"Waiting for {missing} at 127.0.0.1:29511. Unset RANK and WORLD_SIZE")
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
+    ("error", "message"),
     [
         ("Timed out after 601 seconds waiting for clients. 3/4 clients joined.", "Only 3 of 4 processes joined"),
         ("connection refused", "Not all 4 processes joined"),
     ],
 )
-def test_processes_that_never_join_raise(launched: Any, error: str, words: str) -> None:
-    def meet(*_: object, **__: object) -> Any:
+def test_processes_that_never_join_raise(launched: Any, error: str, message: str) -> None:
+    def rendezvous(*_: object, **__: object) -> Any:
         raise RuntimeError(error)
         yield
 
-    launched(VARIABLES | {"WORLD_SIZE": "4"}, meet)
-    with pytest.raises(UnreachableError, match=f"processes of this run: {words} within 10 minutes"):
+    launched(VARIABLES | {"WORLD_SIZE": "4"}, rendezvous)
+    with pytest.raises(UnreachableError, match=f"processes of this run: {message} within 10 minutes"):
         distributed._join_process_group("gloo")

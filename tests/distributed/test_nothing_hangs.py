@@ -19,8 +19,8 @@ from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 
 pytestmark = pytest.mark.usefixtures("default_signals")
-KILLS = int(os.environ.get("VJEPA2_AC_SOAK", "1"))  # 20 before a release
-TRAINS = "-m", "vjepa2_ac.cli", "train"
+NUM_KILLS = int(os.environ.get("VJEPA2_AC_SOAK", "1"))  # 20 before a release
+TRAIN_COMMAND = "-m", "vjepa2_ac.cli", "train"
 STORE = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
 SCRIPT = str(ROOT / "tests/support/disagreeing_ranks.py")
 
@@ -39,7 +39,7 @@ def started(config: object, processes: int) -> list[Rank]:
     run, port = Path(config.run_dir), free_port()
     before = len(steps_of(run))
     path = str(run.parent / "config.yaml")
-    ranks = [start_rank([*TRAINS, path], rank, processes, port) for rank in range(processes)]
+    ranks = [start_rank([*TRAIN_COMMAND, path], rank, processes, port) for rank in range(processes)]
     wait_until(lambda: len(steps_of(run)) > before, ranks, timeout_s=600)
     return ranks
 
@@ -56,20 +56,20 @@ def errors_of(ranks: list[Rank]) -> list[str]:
 
 def test_killed_process_ends_all_and_fewer_processes_resume(endless) -> None:
     """After 4 processes, 3 resume, one with two micro-batches per step; then 4 again, with the same clips."""
-    drawn, run = np.random.default_rng(0), Path(endless.run_dir)
-    for kill in range(KILLS):
+    rng, run = np.random.default_rng(0), Path(endless.run_dir)
+    for kill in range(NUM_KILLS):
         ranks = started(endless, 4 - kill % 2)
-        victim = drawn.integers(len(ranks))
-        time.sleep(drawn.uniform(0.0, 1.0))
+        victim = rng.integers(len(ranks))
+        time.sleep(rng.uniform(0.0, 1.0))
         ranks[victim].kill()
         survivors = [rank for rank in ranks if rank is not ranks[victim]]
-        for said in errors_of(survivors):
-            assert "another process of this run" in said
-            assert "to resume from the newest checkpoint" in said
+        for output in errors_of(survivors):
+            assert "another process of this run" in output
+            assert "to resume from the newest checkpoint" in output
         assert {rank.returncode for rank in survivors} == {2}
-    again = started(endless, 3 + KILLS % 2)
-    again[-1].send_signal(signal.SIGUSR1)
-    finish(again, 75, timeout=300)
+    resumed = started(endless, 3 + NUM_KILLS % 2)
+    resumed[-1].send_signal(signal.SIGUSR1)
+    finish(resumed, 75, timeout=300)
     state = read_state(newest_checkpoint(run / "checkpoints"))
     assert (state.clips_per_step, state.clips_done) == (4, 4 * state.step)
 
@@ -89,14 +89,14 @@ def test_relaunched_processes_resume(make_config, tmp_path: Path, popen) -> None
     words = [sys.executable, "-m", "torch.distributed.run", *launcher, SCRIPT, str(path), "one_is_killed_once"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     started = popen(words, env={**environment, STORE: "1"}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    said, _ = started.communicate(timeout=300)
-    assert started.returncode == 0, said
+    output, _ = started.communicate(timeout=300)
+    assert started.returncode == 0, output
     assert steps_of(run) == [1, 2, 3, 4, 5, 6]
     assert read_state(newest_checkpoint(run / "checkpoints")).num_processes == 2
 
 
 def test_unexpected_error_of_one_process_ends_all_with_one_error(make_config, tmp_path: Path) -> None:
-    """A bug, or a library's error, in a single process: the others do not wait for it."""
+    """After a bug in a single process, the other process does not wait for it."""
     path = tmp_path / "config.yaml"
     path.write_text(config_as_yaml(make_config(training__accumulation=1)))
     (first, _), (second, _) = run_ranks([SCRIPT, str(path), "one_has_a_bug"], status=3)

@@ -45,16 +45,16 @@ def test_two_processes_resumed_as_one_equal_a_single_process_run(without_dropout
     log = tmp_path / "shared/metrics.jsonl"
     wait_until(lambda: any(row["kind"] == "train" for row in read_metrics_log(log)), ranks)
     ranks[1].send_signal(signal.SIGUSR1)
-    (out, errors), (quiet_out, quiet_errors) = finish(ranks, EXIT_STATUS)
-    assert errors.startswith("SIGUSR1: stopped after step"), "the first process says so"
+    (out, errors), (other_out, other_errors) = finish(ranks, EXIT_STATUS)
+    assert errors.startswith("SIGUSR1: stopped after step"), "the first process must report the signal"
     assert "parameters are trained" in out
-    assert (quiet_out, quiet_errors) == ("", ""), "only the first process speaks"
+    assert (other_out, other_errors) == ("", ""), "only the first process may print"
     state = read_state(newest_checkpoint(tmp_path / "shared/checkpoints"))
     assert 1 <= state.step < 16
     assert (state.num_processes, state.clips_per_step, state.clips_done) == (2, 8, 8 * state.step)
     with pytest.raises(StoppedError):
         train(config, signalled_reporter(type(reporter)(), state.step + 1, signal.SIGUSR1))
-    train(config, reporter)  # once more: the number of processes is not another any more, and a step not the config's
+    train(config, reporter)  # resumes again with one process, and with 8 clips per step although the config now gives 4
     assert reporter.steps[0] == state.step + 2
     assert any("computes 4 micro-batches of 2" in note for note in reporter.notes)
     assert_equal_up_to_rounding(whole, tmp_path / "shared")
@@ -82,14 +82,15 @@ def test_collectives_of_a_training_step(tmp_path, without_dropout) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "now", "each"), [(1, 1, None), (1, 2, "2"), (1, 3, "1 or 2"), (2, 1, "8"), (4, 2, "8"), (2, 5, "1 or 2")]
+    ("old_processes", "new_processes", "each"),
+    [(1, 1, None), (1, 2, "2"), (1, 3, "1 or 2"), (2, 1, "8"), (4, 2, "8"), (2, 5, "1 or 2")],
 )
 def test_clips_of_a_step_do_not_depend_on_the_number_of_processes(
-    make_config, reporter, before: int, now: int, each: str | None
+    make_config, reporter, old_processes: int, new_processes: int, each: str | None
 ) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
-    state = RunState(step=3, num_processes=before, clips_per_step=8 * before, clips_per_process=8)
-    assert count_micro_batches(config, state, now, reporter) * 2 == state.clips_per_step
+    state = RunState(step=3, num_processes=old_processes, clips_per_step=8 * old_processes, clips_per_process=8)
+    assert count_micro_batches(config, state, new_processes, reporter) * 2 == state.clips_per_step
     assert [f"computes {each} micro-batches of 2" in note for note in reporter.notes] == [True] * (each is not None)
 
 

@@ -27,12 +27,12 @@ def numbers_of(value: Any, name: str = "") -> dict[str, float]:
         return {}
     if isinstance(value, int | float):
         return {name: float(value)}
-    parts = value.items() if isinstance(value, dict) else enumerate(value)
-    return {place: one for key, part in parts for place, one in numbers_of(part, f"{name}/{key}").items()}
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    return {path: number for key, item in items for path, number in numbers_of(item, f"{name}/{key}").items()}
 
 
-def assert_same(one: dict[str, Any], other: dict[str, Any]) -> None:
-    first, second = numbers_of(one), numbers_of(other)
+def assert_same(actual: dict[str, Any], expected: dict[str, Any]) -> None:
+    first, second = numbers_of(actual), numbers_of(expected)
     assert first.keys() == second.keys()
     for name, value in first.items():
         np.testing.assert_allclose(second[name], value, rtol=1e-6, atol=1e-9, err_msg=name)
@@ -46,9 +46,9 @@ def test_shared_evaluation_equals_single_process_evaluation(make_config, tmp_pat
     run = str(train(config, reporter))
     words = [BROKEN, "evaluate", run, *PROBES, "--out"]
     run_ranks([*words, str(tmp_path / "alone")], 1)
-    said = run_ranks([*words, str(tmp_path / "together")], 3)
-    assert "sensitive to actions" in said[0][0]
-    assert [out for out, _ in said[1:]] == ["", ""], "only the first process speaks"
+    outputs = run_ranks([*words, str(tmp_path / "together")], 3)
+    assert "sensitive to actions" in outputs[0][0]
+    assert [out for out, _ in outputs[1:]] == ["", ""], "only the first process may print"
     alone, together = (json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("alone", "together"))
     assert_same(alone["rows"], together["rows"])
     assert alone["clips"]["count"] == together["clips"]["count"] == 5
@@ -61,7 +61,7 @@ def test_shared_validation_equals_single_process_validation(make_config, tmp_pat
         config = make_config(**changes, run_dir=str(tmp_path / f"{processes}"))
         (tmp_path / f"{processes}.yaml").write_text(config_as_yaml(config))
         run_ranks([BROKEN, "train", str(tmp_path / f"{processes}.yaml")], processes)
-    first, second = ([row for row in metrics(tmp_path / one) if row["kind"] == "validation"] for one in ("1", "2"))
+    first, second = ([row for row in metrics(tmp_path / name) if row["kind"] == "validation"] for name in ("1", "2"))
     np.testing.assert_array_equal(*(list(numbers_of(rows[0]).values()) for rows in (first, second)))
 
 
@@ -69,5 +69,5 @@ def test_error_in_shared_work_is_raised_in_all_processes(make_config, tmp_path: 
     path = tmp_path / "config.yaml"
     path.write_text(config_as_yaml(make_config()))
     script = str(ROOT / "tests/support/disagreeing_ranks.py")
-    said = [out for out, _ in run_ranks([script, str(path), "one_cannot_read_a_validation_clip"], status=3)]
-    assert said == ["InputError: episode 3: its image is damaged.\n"] * 2
+    outputs = [out for out, _ in run_ranks([script, str(path), "one_cannot_read_a_validation_clip"], status=3)]
+    assert outputs == ["InputError: episode 3: its image is damaged.\n"] * 2

@@ -46,7 +46,7 @@ def prediction(world_model: WorldModel) -> torch.Tensor:
 
 def test_run_plans_with_its_own_config(run: Path) -> None:
     subject = load_for_planning(str(run))
-    assert subject.chosen == "step-00000010 (the best by error)"
+    assert subject.checkpoint_label == "step-00000010 (the best by error)"
     assert subject.config.planning.horizon == 2
     controller = Controller.of_subject(subject)
     images = np.random.default_rng(0).integers(0, 256, (2, 40, 64, 3), dtype=np.uint8)

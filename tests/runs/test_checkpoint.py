@@ -1,4 +1,4 @@
-"""Checkpoints: complete or ignored; damage, atomic writes, selection, and untrusted files."""
+"""Checkpoints: atomic writes, damaged checkpoints, selection, and untrusted files."""
 
 import errno
 import json
@@ -55,15 +55,15 @@ def test_damaged_checkpoint_is_skipped_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, fault: str
 ) -> None:
     older, newer = write(tmp_path, 10), write(tmp_path, 20)
-    victim = newer / name
-    content = bytearray(victim.read_bytes())
+    damaged_file = newer / name
+    content = bytearray(damaged_file.read_bytes())
     if fault == "truncate":
-        victim.write_bytes(content[: len(content) // 2])
+        damaged_file.write_bytes(content[: len(content) // 2])
     elif fault == "flip":
         content[len(content) // 2] ^= 0x10
-        victim.write_bytes(content)
+        damaged_file.write_bytes(content)
     else:
-        victim.unlink()
+        damaged_file.unlink()
     with caplog.at_level(logging.WARNING):
         assert newest_checkpoint(tmp_path) == older
     assert str(newer) in caplog.text
@@ -71,9 +71,9 @@ def test_damaged_checkpoint_is_skipped_with_a_warning(
 
 @pytest.mark.parametrize("step", [30, 40])
 def test_incomplete_checkpoint_of_a_killed_writer_is_ignored_and_removed(tmp_path: Path, step: int) -> None:
-    debris = tmp_path / f".writing-{checkpoint_name(30)}"
-    debris.mkdir()
-    write_weights(debris)
+    incomplete = tmp_path / f".writing-{checkpoint_name(30)}"
+    incomplete.mkdir()
+    write_weights(incomplete)
     assert newest_checkpoint(tmp_path) is None
     path = write(tmp_path, step)
     assert list(tmp_path.iterdir()) == [path]
@@ -201,7 +201,7 @@ def test_failed_write_keeps_older_checkpoints_and_leaves_no_partial_one(tmp_path
     faults.set()
     write(tmp_path / "count", 20)
     operations = faults.done
-    assert operations > 10, "folders, files, flushes, a rename"
+    assert operations > 10, "the write creates folders and files, flushes them, and renames the folder"
     for number in range(1, operations + 1):
         folder = tmp_path / str(number)
         faults.set()
@@ -210,35 +210,35 @@ def test_failed_write_keeps_older_checkpoints_and_leaves_no_partial_one(tmp_path
         with pytest.raises(InputError, match=rf"{checkpoint_name(20)}: .*cannot be written \({os.strerror(code)}\)"):
             write(folder, 20)
         assert find_damage(older) is None
-        assert all(find_damage(path) is None for path in folder.iterdir()), "whole or absent"
-        if newest_checkpoint(folder) == older:  # else it was renamed before the flush of its folder failed
+        assert all(find_damage(path) is None for path in folder.iterdir()), "every checkpoint is complete"
+        if newest_checkpoint(folder) == older:  # otherwise the rename succeeded, and the flush of the folder failed
             write(folder, 20)
-        assert newest_checkpoint(folder) == folder / checkpoint_name(20), "with room again"
+        assert newest_checkpoint(folder) == folder / checkpoint_name(20), "a later write must succeed"
 
 
 def test_checkpoint_is_synced_before_an_older_one_is_removed(tmp_path, monkeypatch) -> None:
     write(tmp_path, 10, keep=1)
-    happened: list[str] = []
+    events: list[str] = []
 
-    def noting(what: str, real):
+    def record_calls(event: str, original):
         def operation(*arguments, **options):
-            path = Path(f"/proc/self/fd/{arguments[0]}").readlink() if what == "flush" else Path(arguments[0])
-            happened.append(f"{what} {path.relative_to(tmp_path)}")
-            return real(*arguments, **options)
+            path = Path(f"/proc/self/fd/{arguments[0]}").readlink() if event == "flush" else Path(arguments[0])
+            events.append(f"{event} {path.relative_to(tmp_path)}")
+            return original(*arguments, **options)
 
         return operation
 
-    monkeypatch.setattr(os, "fsync", noting("flush", os.fsync))
-    monkeypatch.setattr(os, "rename", noting("rename", os.rename))
-    monkeypatch.setattr(shutil, "rmtree", noting("remove", shutil.rmtree))
+    monkeypatch.setattr(os, "fsync", record_calls("flush", os.fsync))
+    monkeypatch.setattr(os, "rename", record_calls("rename", os.rename))
+    monkeypatch.setattr(shutil, "rmtree", record_calls("remove", shutil.rmtree))
     written = write(tmp_path, 20, keep=1)
     temporary = f".writing-{checkpoint_name(20)}"
-    renamed = happened.index(f"rename {temporary}")
+    renamed = events.index(f"rename {temporary}")
     parts = [written, *written.rglob("*")]
     assert {f"flush {temporary}/{part.relative_to(written)}".removesuffix("/.") for part in parts} < set(
-        happened[:renamed]
+        events[:renamed]
     )
-    assert happened[renamed + 1 :] == ["flush .", f"remove {checkpoint_name(10)}"]
+    assert events[renamed + 1 :] == ["flush .", f"remove {checkpoint_name(10)}"]
 
 
 @contextmanager
@@ -289,8 +289,10 @@ def test_checkpoint_contains_trained_weights_and_not_the_frozen_base(make_config
     for weights in written.values():
         assert sum(value.numel() for value in weights.values()) == trained
         assert all(re.search(r"\.lora_[AB]|\.action_encoder\.", name) for name in weights)
-    rest = sum(path.stat().st_size for path in checkpoint.rglob("*") if path.name not in {*written, "optimizer.pt"})
-    assert rest < 20_000, "text"
+    other_bytes = sum(
+        path.stat().st_size for path in checkpoint.rglob("*") if path.name not in {*written, "optimizer.pt"}
+    )
+    assert other_bytes < 20_000, "all other files are small text files"
 
 
 class Bomb:
@@ -307,15 +309,15 @@ def test_optimizer_file_with_code_raises_and_is_not_executed(make_config, report
     config = make_config(training__steps=1)
     checkpoint = newest_checkpoint(train(config, reporter) / "checkpoints")
     torch.save({"state": Bomb(tmp_path / "mark")}, checkpoint / "optimizer.pt")
-    write_manifest(checkpoint)  # whoever can write the file can write the manifest
+    write_manifest(checkpoint)  # an attacker who can write the file can also write the manifest
     with pytest.raises(InputError, match=r"optimizer\.pt: objects other than tensors and plain values.*execute code"):
         train(make_config(training__steps=2), reporter, allow_config_change=True)
     assert not (tmp_path / "mark").exists()
     torch.load(checkpoint / "optimizer.pt", weights_only=False)
-    assert (tmp_path / "mark").exists(), "the bomb is one"
+    assert (tmp_path / "mark").exists(), "without weights_only the file executes code"
 
 
-# Files of unknown origin: invalid ones are refused by name
+# Untrusted files: an invalid file raises an error with its name
 
 
 def test_run_state_round_trip_keeps_every_field(tmp_path: Path) -> None:
@@ -325,13 +327,13 @@ def test_run_state_round_trip_keeps_every_field(tmp_path: Path) -> None:
         validation_settings={"data.frames": "16"},
         loss_scale={"scale": 65536.0, "growth_interval": 2000, "_growth_tracker": 0, "growth_factor": float("inf")},
     )  # fmt: skip
-    found = read_state(write_checkpoint(tmp_path, state, lambda _: None, keep=1))
-    assert found == state
-    assert type((found.loss_scale or {})["growth_interval"]) is int
+    loaded = read_state(write_checkpoint(tmp_path, state, lambda _: None, keep=1))
+    assert loaded == state
+    assert type((loaded.loss_scale or {})["growth_interval"]) is int
 
 
 def test_compressed_or_legacy_optimizer_file_raises(tmp_path: Path) -> None:
-    """Loading a small file in one of these formats may need any amount of memory."""
+    """Loading a small file in these formats may need unlimited memory."""
     with (tmp_path / "optimizer.pt").open("wb") as file:
         write_torch({"a": torch.zeros(1000)}, file)
     assert read_torch(tmp_path / "optimizer.pt")["a"].shape == (1000,)
@@ -360,7 +362,7 @@ def run(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("by", "words"),
+    ("selection", "description"),
     [
         ("newest", "step-00000030 (the newest)"),
         ("selected", "step-00000020 (the best by error)"),
@@ -368,10 +370,10 @@ def run(tmp_path: Path) -> Path:
         ("10", "step-00000010 (as requested)"),
     ],
 )
-def test_checkpoints_are_selected_by_newest_best_and_step(run: Path, by: str, words: str) -> None:
-    chosen = select_checkpoint(run, by)
-    assert str(chosen) == words
-    assert chosen.path == run / "checkpoints" / words.split(maxsplit=1)[0]
+def test_checkpoints_are_selected_by_newest_best_and_step(run: Path, selection: str, description: str) -> None:
+    checkpoint = select_checkpoint(run, selection)
+    assert str(checkpoint) == description
+    assert checkpoint.path == run / "checkpoints" / description.split(maxsplit=1)[0]
 
 
 @pytest.mark.parametrize(
@@ -383,23 +385,23 @@ def test_checkpoints_are_selected_by_newest_best_and_step(run: Path, by: str, wo
         ("", ""),
     ],
 )
-def test_reasons_of_older_files_equal_those_written_now(written: str, reason: str) -> None:
+def test_reason_in_an_older_file_equals_the_current_reason(written: str, reason: str) -> None:
     assert selection_reason(written) == reason
 
 
-@pytest.mark.parametrize(("by", "found"), [("15", "no checkpoint of step 15"), ("bset", "--checkpoint bset")])
-def test_missing_checkpoint_raises_with_the_existing_steps(run: Path, by: str, found: str) -> None:
+@pytest.mark.parametrize(("selection", "problem"), [("15", "no checkpoint of step 15"), ("bset", "--checkpoint bset")])
+def test_missing_checkpoint_raises_with_the_existing_steps(run: Path, selection: str, problem: str) -> None:
     with pytest.raises(
-        InputError, match=rf"{found}.*\. Expected selected, newest, best or one of the steps 10, 20, 30"
+        InputError, match=rf"{problem}.*\. Expected selected, newest, best or one of the steps 10, 20, 30"
     ):
-        select_checkpoint(run, by)
+        select_checkpoint(run, selection)
 
 
 def test_damaged_requested_checkpoint_raises(run: Path) -> None:
     (run / "checkpoints/step-00000020/optimizer.pt").write_bytes(b"torn")
-    for by in ("best", "20"):
+    for selection in ("best", "20"):
         with pytest.raises(InputError, match=r"step-00000020 is damaged: .*one of the steps 10, 30"):
-            select_checkpoint(run, by)
+            select_checkpoint(run, selection)
 
 
 def test_selection_without_validations_or_checkpoints(tmp_path: Path) -> None:
@@ -420,6 +422,6 @@ def test_selection_without_validations_or_checkpoints(tmp_path: Path) -> None:
 def test_state_with_wrong_types_raises(tmp_path: Path, changes: dict[str, object]) -> None:
     checkpoint = write(tmp_path, 10)
     (checkpoint / "state.json").write_text(json.dumps({"step": 10, "clips_done": 40} | changes))
-    write_manifest(checkpoint)  # whoever can write the file can write the manifest
+    write_manifest(checkpoint)  # an attacker who can write the file can also write the manifest
     with pytest.raises(InputError, match=f"state.json: .*{next(iter(changes))}.*older one"):
         read_state(newest_checkpoint(tmp_path))

@@ -33,7 +33,7 @@ from vjepa2_ac.runs.open_run import open_run
 from vjepa2_ac.training import loop
 from vjepa2_ac.training.loop import train
 
-HOLD = """
+HOLD_LOCK = """
 import sys
 from pathlib import Path
 from vjepa2_ac.runs.folder import RunLock
@@ -47,9 +47,9 @@ sys.stdin.read()
 def test_run_starts_after_a_start_was_killed_at_any_file(make_config, tmp_path, monkeypatch) -> None:
     faults = Faults(monkeypatch)
     monkeypatch.setattr(Path, "unlink", lambda *_, **__: None)
-    for dies_at in range(1, 100):
-        config = make_config(run_dir=str(tmp_path / str(dies_at) / "run"))
-        faults.set(dies_at, KilledError())
+    for killed_at in range(1, 100):
+        config = make_config(run_dir=str(tmp_path / str(killed_at) / "run"))
+        faults.set(killed_at, KilledError())
         try:
             with RunLock(Path(config.run_dir)) as lock:
                 lock.take()
@@ -58,7 +58,7 @@ def test_run_starts_after_a_start_was_killed_at_any_file(make_config, tmp_path, 
             check_run_folder(config)
         else:
             break
-    assert dies_at > 9, "folders, two files that are flushed and renamed"
+    assert killed_at > 9, "a start creates folders, and writes, flushes and renames two files"
     faults.set()
     check_run_folder(config)
 
@@ -83,12 +83,12 @@ def test_invalid_small_files_of_a_run_raise_input_errors(tmp_path: Path, make_co
             read_or_create_run_id(tmp_path)
 
 
-# The lock
+# Lock
 
 
 def test_folder_in_use_raises_until_its_process_is_killed(tmp_path: Path) -> None:
-    words = [sys.executable, "-c", HOLD, str(tmp_path / "run")]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    command = [sys.executable, "-c", HOLD_LOCK, str(tmp_path / "run")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "held\n"
         with RunLock(tmp_path / "run") as lock, pytest.raises(InputError, match="in use by another process"):
             lock.take()
@@ -114,31 +114,31 @@ def test_file_system_without_locks_causes_a_warning(
 
 
 def test_run_folder_is_locked_while_training_and_released_afterwards(make_config, reporter) -> None:
-    refused = []
+    refused_steps = []
 
-    def try_to_train_too(step: int, metrics: object) -> None:
+    def train_in_the_same_folder(step: int, metrics: object) -> None:
         del metrics
         with pytest.raises(InputError, match=rf"by process {os.getpid()} on .+, since 20"):
-            train(make_config(training__steps=2), other)
-        refused.append(step)
+            train(make_config(training__steps=2), other_reporter)
+        refused_steps.append(step)
 
-    other, reporter.on_step = type(reporter)(), try_to_train_too
+    other_reporter, reporter.on_step = type(reporter)(), train_in_the_same_folder
     train(make_config(training__steps=2), reporter)
-    assert refused == [1, 2]
-    assert other.notes == [], "refused before anything was loaded"
-    train(make_config(training__steps=2), other)
+    assert refused_steps == [1, 2]
+    assert other_reporter.notes == [], "refused before anything was loaded"
+    train(make_config(training__steps=2), other_reporter)
 
 
-def test_start_overtaken_by_another_one_raises_and_changes_nothing(make_config, reporter, monkeypatch) -> None:
+def test_start_raises_if_another_start_has_trained_meanwhile(make_config, reporter, monkeypatch) -> None:
     config, restore = make_config(), loop.restore
 
-    def overtaken(*arguments):
+    def restore_after_another_start(*arguments):
         run = restore(*arguments)
         monkeypatch.setattr(loop, "restore", restore)
         train(config, type(reporter)())
         return run
 
-    monkeypatch.setattr(loop, "restore", overtaken)
+    monkeypatch.setattr(loop, "restore", restore_after_another_start)
     with pytest.raises(InputError, match="step 6 from another start; this start is at step 0"):
         train(config, reporter)
     assert newest_checkpoint(Path(config.run_dir) / "checkpoints").name == "step-00000006"
@@ -178,21 +178,23 @@ def test_only_missing_paths_are_resolved_from_the_folder_of_the_start(at_home, h
     (home / "run/environment.json").write_text(json.dumps([{"folder": str(home)}]))
     monkeypatch.chdir(elsewhere)
 
-    def seen(**changes: object):  # type: ignore[no-untyped-def]
-        data = {key: one for key, one in values["data"].items() if key != "fields" or "source" not in changes}
+    def read_data_config(**changes: object):  # type: ignore[no-untyped-def]
+        data = {key: value for key, value in values["data"].items() if key != "fields" or "source" not in changes}
         changed = parse_config({**values, "data": {**data, **changes}}, where="")
         (home / "run/config.yaml").write_text(config_as_yaml(changed))
         return read_run_config(home / "run").data
 
-    found = seen()
-    assert (found.path, found.cache_dir, found.disk_cache.dir) == ("data", str(home / "caches"), "none")
-    assert found.idle.ranges == str(home / "ranges.json")
-    assert seen(source="latents").idle.ranges == "ranges.json", "a part of the cache's key"
+    resolved = read_data_config()
+    assert (resolved.path, resolved.cache_dir, resolved.disk_cache.dir) == ("data", str(home / "caches"), "none")
+    assert resolved.idle.ranges == str(home / "ranges.json")
+    assert read_data_config(source="latents").idle.ranges == "ranges.json", (
+        "with cached latents the path is only a part of the cache's key"
+    )
     for path in ("gs://bucket/set", "/nowhere/set"):
-        assert seen(path=path).path == path
+        assert read_data_config(path=path).path == path
 
 
-# Addresses in a run of unknown origin are listed before one of them is contacted
+# URLs in the config of an untrusted run are printed before they are used
 
 ELSEWHERE = {
     "run_dir": "r",
@@ -222,19 +224,19 @@ def test_remote_locations_of_a_run_are_printed_before_they_are_used(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("b.pt").touch()
-    run = tmp_path / "[b]run"  # no markup
+    run = tmp_path / "[b]run"  # must not be interpreted as markup
     run.mkdir()
     (run / "config.yaml").write_text(config_as_yaml(parse_config(ELSEWHERE, where="")))
-    said: list[str] = []
+    printed: list[str] = []
 
-    def contact(*_: Any, **__: Any) -> None:
-        said.append(capsys.readouterr().out)
+    def stop(*_: Any, **__: Any) -> None:
+        printed.append(capsys.readouterr().out)
         raise InputError(where="here", found="the end")
 
-    monkeypatch.setattr("vjepa2_ac.training.loop.train", contact)
+    monkeypatch.setattr("vjepa2_ac.training.loop.train", stop)
     assert main(["train", str(run), "--resume"]) == 2
     for line in LINES:
-        assert f"The config of {run} contains a URL: {line}" in " ".join(said[0].split())
+        assert f"The config of {run} contains a URL: {line}" in " ".join(printed[0].split())
 
 
 OLDER = {
@@ -242,7 +244,7 @@ OLDER = {
     "connections": 16,
     "prefetch": 2,
     "short_episodes": "skip",
-}  # as before `splits`
+}  # keys of configs from before the key `data.splits`
 OPEN_REMOTE = "vjepa2_ac.runs.open_run.open_remote"
 
 
@@ -303,7 +305,7 @@ def test_older_run_keeps_its_drawn_splits_unless_the_config_sets_them(make_confi
     with open_run(config, reporter) as opened:
         opened.begin(opened.config, RunState(step=0))
     with open_run(config, reporter) as opened:
-        assert [one.splits for one in opened.config.data_sets] == ["dataset", "dataset"]
+        assert [data.splits for data in opened.config.data_sets] == ["dataset", "dataset"]
     file = Path(config.run_dir) / "config.yaml"
     values = yaml.safe_load(file.read_text())
     values["data"] = {key: value for key, value in values["data"].items() if key != "splits"} | OLDER
@@ -311,7 +313,7 @@ def test_older_run_keeps_its_drawn_splits_unless_the_config_sets_them(make_confi
     file.write_text(yaml.safe_dump(values))
     assert read_run_config(file.parent).data.splits == "hash"
     with open_run(config, reporter) as opened:
-        assert [one.splits for one in opened.config.data_sets] == ["hash", "hash"]
+        assert [data.splits for data in opened.config.data_sets] == ["hash", "hash"]
     other = make_config(replay={"data": data}, data__splits="dataset")
     with pytest.raises(InputError, match=r"differs in data\.splits"), open_run(other, reporter):
         pass

@@ -37,25 +37,25 @@ def test_incomplete_and_invalid_rows_are_removed(tmp_path: Path) -> None:
 
 
 def test_rows_are_synced_before_the_next_checkpoint(make_config, reporter, monkeypatch) -> None:
-    """Otherwise a run could resume, after a power cut, from a checkpoint whose rows are lost."""
+    """Otherwise the rows before a checkpoint could be lost in a power cut, although the run resumes after them."""
     flushed: list[str] = []
-    real = os.fsync
+    original = os.fsync
 
     def fsync(handle: int) -> None:
         path = Path(f"/proc/self/fd/{handle}").readlink()
         rows = f" {path.stat().st_size}" if path.name == "metrics.jsonl" else ""
         flushed.append(path.name + rows)
-        real(handle)
+        original(handle)
 
     monkeypatch.setattr(os, "fsync", fsync)
     folder = train(make_config(training__steps=2, training__learning_rate=1e-9, checkpoint__every=1), reporter)
-    states = [place for place, name in enumerate(flushed) if name == "state.json"]
-    sizes = [row["step"] for row in read_metrics_log(folder / "metrics.jsonl")]
-    assert sizes == [0, 1, 2, 2], "a validation, a step, a step and its validation"
+    states = [index for index, name in enumerate(flushed) if name == "state.json"]
+    logged_steps = [row["step"] for row in read_metrics_log(folder / "metrics.jsonl")]
+    assert logged_steps == [0, 1, 2, 2], "validation, step 1, step 2, validation"
     lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
-    ends = [len("".join(lines[:rows])) for rows in (1, 2, 4)]  # of the base, and of both steps
-    for place, end in zip(states, ends, strict=True):
-        assert f"metrics.jsonl {end}" in flushed[:place]
+    ends = [len("".join(lines[:rows])) for rows in (1, 2, 4)]  # after the base model's validation, and after each step
+    for index, end in zip(states, ends, strict=True):
+        assert f"metrics.jsonl {end}" in flushed[:index]
 
 
 class FullDisk:
@@ -73,26 +73,26 @@ class FullDisk:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def full_from(disk: FullDisk, reporter, at: int):
-    stepped = reporter.on_step
+def fill_disk_at(disk: FullDisk, reporter, full_step: int):
+    on_step = reporter.on_step
 
-    def step_on(step: int, metrics: dict) -> None:
-        stepped(step, metrics)
-        disk.is_full = step >= at
+    def on_step_with_full_disk(step: int, metrics: dict) -> None:
+        on_step(step, metrics)
+        disk.is_full = step >= full_step
 
-    reporter.on_step = step_on
+    reporter.on_step = on_step_with_full_disk
     return reporter
 
 
 def test_unwritable_metrics_log_raises_after_saving_a_checkpoint(make_config, reporter, tmp_path, monkeypatch) -> None:
-    disk, quiet = FullDisk(monkeypatch), type(reporter)()
+    disk, second_reporter = FullDisk(monkeypatch), type(reporter)()
     config = make_config(checkpoint__every=100, checkpoint__keep_best=False)
     with pytest.raises(InputError, match=r"metrics\.jsonl: .*No space left on device.*The checkpoint of this step is"):
-        train(config, full_from(disk, reporter, 4))
-    assert reporter.steps[-1] == 4, "it ended at once"
+        train(config, fill_disk_at(disk, reporter, 4))
+    assert reporter.steps[-1] == 4, "the run must end immediately"
     disk.is_full = False
-    train(config, quiet)
-    assert quiet.steps == [5, 6], "no step was lost"
+    train(config, second_reporter)
+    assert second_reporter.steps == [5, 6], "no step may be lost"
     assert [row["step"] for row in read_metrics_log(tmp_path / "run/metrics.jsonl") if row["kind"] == "train"] == [
         1, 2, 3, 5, 6
     ]  # fmt: skip
@@ -103,32 +103,32 @@ def test_run_continues_with_all_metrics_after_a_checkpoint_frees_disk_space(
 ) -> None:
     disk, save = FullDisk(monkeypatch), outputs.save_checkpoint
 
-    def make_room(*arguments: object) -> None:
+    def save_and_free_disk(*arguments: object) -> None:
         save(*arguments)
         disk.is_full = False
 
-    monkeypatch.setattr(outputs, "save_checkpoint", make_room)
-    train(make_config(), full_from(disk, reporter, 3))
+    monkeypatch.setattr(outputs, "save_checkpoint", save_and_free_disk)
+    train(make_config(), fill_disk_at(disk, reporter, 3))
     assert_same_run(whole_run, tmp_path / "run")
 
 
 def test_failed_flush_raises_although_the_next_one_succeeds(tmp_path: Path, monkeypatch) -> None:
     """After a failed fsync the system may have discarded the data."""
-    real, failures = os.fsync, [OSError(errno.EIO, "Input/output error")]
+    original, failures = os.fsync, [OSError(errno.EIO, "Input/output error")]
 
     def fsync(handle: int) -> None:
         if failures:
             raise failures.pop()
-        real(handle)
+        original(handle)
 
-    def checkpoint() -> None:
+    def flush_and_save() -> None:
         with log.flush_before_checkpoint():
             pass
 
     with MetricsLog(tmp_path, first_step=0) as log:
         monkeypatch.setattr(os, "fsync", fsync)
         with pytest.raises(InputError, match="Input/output error"):
-            checkpoint()
+            flush_and_save()
 
 
 def test_non_finite_values_become_null(tmp_path: Path) -> None:
@@ -142,7 +142,7 @@ def test_a_disk_that_stalls_causes_a_warning(
 ) -> None:
     monkeypatch.setattr(metrics_log, "STALLED_S", 0.01)
     with metrics_log.warn_if_stalled(tmp_path):
-        until = time.monotonic() + 60
-        while not caplog.records and time.monotonic() < until:
+        deadline = time.monotonic() + 60
+        while not caplog.records and time.monotonic() < deadline:
             time.sleep(0.002)
     assert "writing this file takes more than 0.01 s; training waits for the disk" in caplog.text

@@ -1,4 +1,4 @@
-"""Resuming from the mirror: another machine continues the run without a difference, whenever the first one died."""
+"""Resume from the mirror: another machine continues the run exactly, whenever the first machine was killed."""
 
 import logging
 import shutil
@@ -10,7 +10,7 @@ import pytest
 
 from accidents import KilledError, without_permission
 from gcs import Gcs
-from mirrors import PLACE, content, names, remote_checkpoints, write
+from mirrors import REMOTE, content, names, remote_checkpoints, write
 from run_fixtures import SilentReporter, at_step, signalled_reporter
 from same_run import assert_same_run
 from vjepa2_ac import storage
@@ -26,15 +26,15 @@ from vjepa2_ac.runs.open_run import open_remote
 from vjepa2_ac.training.loop import train
 
 MakeConfig = Callable[..., Config]
-FILES = 4  # the manifest under another name, state.json and two more come before the manifest
+FILES = 4  # uploaded before the manifest: the manifest under another name, state.json and two others
 
 
 @pytest.fixture
 def config(make_config: Callable[..., Config]) -> Config:
-    return make_config(checkpoint__remote=PLACE)
+    return make_config(checkpoint__remote=REMOTE)
 
 
-def run_there(gcs: Gcs, config: Config, *steps: int, run_id: str = "mine", **state: object) -> Path:
+def upload_run(gcs: Gcs, config: Config, *steps: int, run_id: str = "mine", **state: object) -> Path:
     """Upload a run with these checkpoints; return its local folder."""
     folder = Path(config.run_dir).parent / f"uploaded-{run_id}"
     for step in steps:
@@ -47,7 +47,7 @@ def run_there(gcs: Gcs, config: Config, *steps: int, run_id: str = "mine", **sta
     return folder
 
 
-def local(config: Config) -> Path:
+def run_folder(config: Config) -> Path:
     return Path(config.run_dir)
 
 
@@ -56,21 +56,21 @@ def test_empty_remote_folder_is_tested_and_left_empty(bucket: Gcs, config: Confi
     assert bucket.names("bucket") == ["other"]
     assert [r.target.split("/")[0] for r in bucket.requests if "write-check" in r.target] == ["POST ", "DELETE "]
     assert len(bucket.uploads()) == 1
-    assert not local(config).exists()
+    assert not run_folder(config).exists()
 
 
 def test_new_machine_downloads_the_newest_checkpoint_and_the_small_files(bucket: Gcs, config: Config) -> None:
-    source, reporter = run_there(bucket, config, 5, 10, 20, best_step=10, best_error=0.5), SilentReporter()
+    source, reporter = upload_run(bucket, config, 5, 10, 20, best_step=10, best_error=0.5), SilentReporter()
     assert open_remote(config, reporter) == config
-    newest = newest_checkpoint(local(config) / "checkpoints")
+    newest = newest_checkpoint(run_folder(config) / "checkpoints")
     assert newest is not None
     assert newest.name == checkpoint_name(20)
     assert read_state(newest).run_id == "mine"
     expected = {name: data for name, data in content(source).items() if checkpoint_name(5) not in name}
-    assert content(local(config)) == expected
+    assert content(run_folder(config)) == expected
     assert reporter.notes == [
-        f"{PLACE} is writable. It is updated every 30 minutes, and at the end of the run.",
-        f"Downloaded {checkpoint_name(20)} from {PLACE}.",
+        f"{REMOTE} is writable. It is updated every 30 minutes, and at the end of the run.",
+        f"Downloaded {checkpoint_name(20)} from {REMOTE}.",
     ]
     check_run_folder(config)
 
@@ -79,71 +79,73 @@ def test_new_machine_downloads_the_newest_checkpoint_and_the_small_files(bucket:
 def test_damaged_remote_checkpoint_is_skipped_with_a_warning(
     bucket: Gcs, config: Config, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    run_there(bucket, config, 10, 20)
+    upload_run(bucket, config, 10, 20)
     name = "manifest.json" if damage == "manifest" else "optimizer.pt"
-    victim = f"run/checkpoints/{checkpoint_name(20)}/{name}"
-    data = bytearray(storage.read_bytes(f"gs://bucket/{victim}"))
+    damaged_file = f"run/checkpoints/{checkpoint_name(20)}/{name}"
+    data = bytearray(storage.read_bytes(f"gs://bucket/{damaged_file}"))
     if damage == "remove":
-        storage.remove(f"gs://bucket/{victim}")
+        storage.remove(f"gs://bucket/{damaged_file}")
     else:
         data[5] ^= 1
-        bucket.put(f"bucket/{victim}", bytes(data) if damage == "flip" else b"{")
+        bucket.put(f"bucket/{damaged_file}", bytes(data) if damage == "flip" else b"{")
     open_remote(config, SILENT)
-    assert [path.name for path in (local(config) / "checkpoints").iterdir()] == [checkpoint_name(10)]
-    assert remote_checkpoints(PLACE) == [checkpoint_name(10)], "the damaged checkpoint is removed"
+    assert [path.name for path in (run_folder(config) / "checkpoints").iterdir()] == [checkpoint_name(10)]
+    assert remote_checkpoints(REMOTE) == [checkpoint_name(10)], "the damaged checkpoint is removed"
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
-    assert f"{PLACE}: {checkpoint_name(20)}" in caplog.text
+    assert f"{REMOTE}: {checkpoint_name(20)}" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["state.json", "manifest.json", "optimizer.pt"])
-@pytest.mark.parametrize("here", [None, 10])
+@pytest.mark.parametrize("local_step", [None, 10])
 def test_unreadable_remote_checkpoint_raises_and_is_kept(
-    make_config: MakeConfig, tmp_path: Path, name: str, here: int | None
+    make_config: MakeConfig, tmp_path: Path, name: str, local_step: int | None
 ) -> None:
-    place = tmp_path / "disk/run"
-    config = make_config(checkpoint__remote=str(place))
+    remote = tmp_path / "disk/run"
+    config = make_config(checkpoint__remote=str(remote))
     for step in (10, 20):
-        write(place, step)
-    (place / "config.yaml").write_text(config_as_yaml(config))
-    if here is not None:
-        write(local(config), here)
-    before = content(place)
-    refused = place / "checkpoints" / checkpoint_name(20) / name
-    with without_permission(refused), pytest.raises((InputError, RefusedError, PermissionError), match="Permission"):
+        write(remote, step)
+    (remote / "config.yaml").write_text(config_as_yaml(config))
+    if local_step is not None:
+        write(run_folder(config), local_step)
+    before = content(remote)
+    unreadable = remote / "checkpoints" / checkpoint_name(20) / name
+    with without_permission(unreadable), pytest.raises((InputError, RefusedError, PermissionError), match="Permission"):
         open_remote(config, SILENT)
-    assert content(place) == before
-    assert [path.name for path in (local(config) / "checkpoints").glob("step-*")] == [checkpoint_name(10)] * bool(here)
+    assert content(remote) == before
+    assert [path.name for path in (run_folder(config) / "checkpoints").glob("step-*")] == [checkpoint_name(10)] * bool(
+        local_step
+    )
 
 
-@pytest.mark.parametrize(("here", "remote_step", "expected"), [(10, 20, 20), (20, 10, 20), (20, 20, 20)])
+@pytest.mark.parametrize(("local_step", "remote_step", "expected"), [(10, 20, 20), (20, 10, 20), (20, 20, 20)])
 def test_run_resumes_from_the_later_of_local_and_remote_checkpoint(
-    bucket: Gcs, config: Config, here: int, remote_step: int, expected: int
+    bucket: Gcs, config: Config, local_step: int, remote_step: int, expected: int
 ) -> None:
-    run_there(bucket, config, remote_step)
-    write(local(config), here)
-    (local(config) / "config.yaml").write_text(config_as_yaml(config))
+    upload_run(bucket, config, remote_step)
+    write(run_folder(config), local_step)
+    (run_folder(config) / "config.yaml").write_text(config_as_yaml(config))
     open_remote(config, SILENT)
-    assert newest_checkpoint(local(config) / "checkpoints").name == checkpoint_name(expected)
-    assert bool(bucket.bytes_read("optimizer.pt")) == (remote_step > here)
+    assert newest_checkpoint(run_folder(config) / "checkpoints").name == checkpoint_name(expected)
+    assert bool(bucket.bytes_read("optimizer.pt")) == (remote_step > local_step)
 
 
 def test_remote_run_with_another_config_raises(bucket: Gcs, config: Config) -> None:
-    run_there(bucket, config, 10)
+    upload_run(bucket, config, 10)
     training = config.training.model_copy(update={"learning_rate": 0.5})
     other = config.model_copy(update={"training": training})
-    with pytest.raises(InputError, match=rf"{PLACE}: a run with another config; it differs in training.learning_rate"):
+    with pytest.raises(InputError, match=rf"{REMOTE}: a run with another config; it differs in training.learning_rate"):
         open_remote(other, SILENT)
-    assert not local(config).exists(), "nothing has come"
+    assert not run_folder(config).exists(), "nothing may be downloaded"
     open_remote(other, SILENT, allow_config_change=True)
-    assert newest_checkpoint(local(config) / "checkpoints") is not None
+    assert newest_checkpoint(run_folder(config) / "checkpoints") is not None
 
 
 def test_remote_folder_of_another_run_raises(bucket: Gcs, config: Config) -> None:
-    run_there(bucket, config, 10, run_id="other")
+    upload_run(bucket, config, 10, run_id="other")
     before = bucket.names("bucket")
-    write(local(config), 20)
+    write(run_folder(config), 20)
     with pytest.raises(
-        InputError, match=rf"{PLACE} contains a checkpoint of another run, {checkpoint_name(10)}.*Set an"
+        InputError, match=rf"{REMOTE} contains a checkpoint of another run, {checkpoint_name(10)}.*Set an"
     ):
         open_remote(config, SILENT)
     assert bucket.names("bucket") == before
@@ -154,7 +156,7 @@ def test_unreachable_remote_folder_causes_a_warning(
 ) -> None:
     bucket.fail_next(503, times=99)
     assert open_remote(config, SILENT) == config
-    assert len(bucket.requests) == 5, "one call, and no other once it failed"
+    assert len(bucket.requests) == 5, "no further request may follow the failed one"
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert "HTTP 503" in caplog.text
     assert "the state on this machine (no checkpoint)" in caplog.text
@@ -163,19 +165,19 @@ def test_unreachable_remote_folder_causes_a_warning(
 def test_failed_download_of_a_remote_checkpoint_raises(
     bucket: Gcs, config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
-    run_there(bucket, config, 20)
+    upload_run(bucket, config, 20)
     bucket.fail_next(503, times=99, match="/download/.*optimizer")
     with pytest.raises(UnreachableError, match="optimizer"):
         open_remote(config, SILENT)
     caplog.clear()
-    write(local(config), 10)
+    write(run_folder(config), 10)
     assert open_remote(config, SILENT) == config
     assert f"the state on this machine (step 10; {checkpoint_name(20)} is newer)" in caplog.text
 
 
 def test_failed_download_of_a_remote_run_without_checkpoint_raises(bucket: Gcs, config: Config) -> None:
-    run_there(bucket, config, 20)
-    RemoteCheckpoints(PLACE).remove(checkpoint_name(20))
+    upload_run(bucket, config, 20)
+    RemoteCheckpoints(REMOTE).remove(checkpoint_name(20))
     bucket.put(f"bucket/run/checkpoints/{checkpoint_name(20)}/state.json", b'{"run_id": "mine", "step": 20}')
     bucket.fail_next(503, times=99, match="/download/.*config.yaml")
     with pytest.raises(UnreachableError, match=r"config\.yaml"):
@@ -205,42 +207,42 @@ def test_missing_bucket_raises(bucket: Gcs, make_config: Callable[..., Config]) 
 
 @pytest.mark.parametrize("inner", ["", "mirror"])
 def test_mirror_inside_the_run_folder_raises(make_config: Callable[..., Config], inner: str) -> None:
-    folder = local(make_config())
+    folder = run_folder(make_config())
     with pytest.raises(InputError, match="a folder outside run_dir"):
         open_remote(make_config(checkpoint__remote=str(folder / inner)), SILENT)
 
 
 def test_run_folder_is_locked_before_a_download(bucket: Gcs, config: Config) -> None:
     """With two simultaneous starts, the second one would overwrite newer metrics of the first."""
-    run_there(bucket, config, 10)
-    with RunLock(local(config)) as first, RunLock(local(config)) as second:
+    upload_run(bucket, config, 10)
+    with RunLock(run_folder(config)) as first, RunLock(run_folder(config)) as second:
         first.take()
-        before = content(local(config))
+        before = content(run_folder(config))
         with pytest.raises(InputError, match="in use by"):
             open_remote(config, SILENT, lock=second)
-        assert content(local(config)) == before
-    with RunLock(local(config)) as lock:
+        assert content(run_folder(config)) == before
+    with RunLock(run_folder(config)) as lock:
         open_remote(config, SILENT, lock=lock)
-        with RunLock(local(config)) as other, pytest.raises(InputError, match="in use by"):
+        with RunLock(run_folder(config)) as other, pytest.raises(InputError, match="in use by"):
             other.take()
 
 
 def test_interrupted_download_starts_again(bucket: Gcs, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, download = run_there(bucket, config, 10), storage.download
+    source, download = upload_run(bucket, config, 10), storage.download
 
     def killed(source: str, target: Path) -> None:
         if "optimizer" in source:
             raise KilledError
         download(source, target)
 
-    with monkeypatch.context() as dying:
-        dying.setattr(storage, "download", killed)
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "download", killed)
         with pytest.raises(KilledError):
             open_remote(config, SILENT)
-    assert newest_checkpoint(local(config) / "checkpoints") is None
+    assert newest_checkpoint(run_folder(config) / "checkpoints") is None
     check_run_folder(config)
     open_remote(config, SILENT)
-    assert content(local(config)) == content(source)
+    assert content(run_folder(config)) == content(source)
 
 
 # A run that resumes on another machine
@@ -250,9 +252,9 @@ def test_interrupted_download_starts_again(bucket: Gcs, config: Config, monkeypa
 def config_on(make_config: MakeConfig, tmp_path: Path) -> MakeConfig:
     """Return a function that makes the config of a machine, which uploads each checkpoint immediately."""
 
-    def config(machine: str, place: str = PLACE, **changes: object) -> Config:
-        usual = {"checkpoint__remote_every_minutes": 0.0, "checkpoint__keep_best": "off"}
-        return make_config(run_dir=str(tmp_path / machine), checkpoint__remote=place, **(usual | changes))
+    def config(machine: str, remote: str = REMOTE, **changes: object) -> Config:
+        defaults = {"checkpoint__remote_every_minutes": 0.0, "checkpoint__keep_best": "off"}
+        return make_config(run_dir=str(tmp_path / machine), checkpoint__remote=remote, **(defaults | changes))
 
     return config
 
@@ -267,14 +269,14 @@ def test_resume_on_a_new_machine_after_preemption_is_exact(
     config_on: MakeConfig, reporter, tmp_path: Path, whole_run: Path
 ) -> None:
     stop_after(3, config_on("one"), reporter)
-    assert remote_checkpoints(PLACE)[-1] == checkpoint_name(3), "sent before the process ends"
+    assert remote_checkpoints(REMOTE)[-1] == checkpoint_name(3), "the upload must precede the end of the process"
     shutil.rmtree(tmp_path / "one")
     train(config_on("two"), reporter)
     assert reporter.steps == [4, 5, 6]
     assert_same_run(whole_run, tmp_path / "two")
-    assert remote_checkpoints(PLACE)[-1] == checkpoint_name(6)
+    assert remote_checkpoints(REMOTE)[-1] == checkpoint_name(6)
     train(config_on("three"), reporter)
-    assert reporter.steps == [4, 5, 6], "a run that is done is done everywhere"
+    assert reporter.steps == [4, 5, 6], "a finished run must not be trained again on another machine"
     assert_same_run(whole_run, tmp_path / "three")
 
 
@@ -290,7 +292,7 @@ def test_unreachable_remote_folder_causes_warnings_and_loses_no_step(
     warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(warnings) == 3
     assert "HTTP 503" in warnings[0]
-    assert "HTTP 503" in warnings[1], "once more, however often it is tried"
+    assert "HTTP 503" in warnings[1], "all failed uploads cause only one warning"
     assert "are only on this machine" in warnings[2]
     assert bucket.names("bucket") == ["other"]
 
@@ -320,34 +322,34 @@ def test_failing_run_uploads_its_last_checkpoint(config_on: MakeConfig, reporter
 
     with pytest.raises(InputError, match="not finite"):
         train(config_on("one", checkpoint__remote_every_minutes=1e6), at_step(reporter, 5, fail))
-    assert remote_checkpoints(PLACE)[-1] == checkpoint_name(4)
+    assert remote_checkpoints(REMOTE)[-1] == checkpoint_name(4)
 
 
-# A machine killed in an upload
+# A machine that is killed during an upload
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> str:
+def remote(tmp_path: Path) -> str:
     return str(tmp_path / "disk/run")
 
 
-def die_in_upload(config: object, reporter, monkeypatch: pytest.MonkeyPatch, *, before_file: int) -> None:
+def kill_during_upload(config: object, reporter, monkeypatch: pytest.MonkeyPatch, *, before_file: int) -> None:
     """Train, and simulate a kill before the upload of checkpoint file number `before_file`."""
-    sent, real = list[str](), storage.upload
+    uploaded, original = list[str](), storage.upload
 
     def upload(source: Path, target: str) -> None:
         if "/checkpoints/" in target:
-            if len(sent) == before_file:
+            if len(uploaded) == before_file:
                 raise KilledError
-            sent.append(target)
-        real(source, target)
+            uploaded.append(target)
+        original(source, target)
 
-    with monkeypatch.context() as dying:
-        dying.setattr(storage, "upload", upload)
-        dying.setattr(Mirror, "_start_pass", Mirror._run_pass)  # in the thread of the run, so that its end ends the run
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "upload", upload)
+        patch.setattr(Mirror, "_start_pass", Mirror._run_pass)  # in the main thread, so that the exception ends the run
         with pytest.raises(KilledError):
             train(config, reporter)
-    assert len(sent) == before_file
+    assert len(uploaded) == before_file
 
 
 @pytest.mark.parametrize(
@@ -359,39 +361,39 @@ def test_run_killed_during_an_upload_resumes_from_the_last_complete_checkpoint(
     reporter,
     monkeypatch,
     tmp_path: Path,
-    place: str,
+    remote: str,
     before_file,
     machine,
     complete,
     caplog,
     whole_run: Path,
 ) -> None:
-    die_in_upload(config_on("this", place), reporter, monkeypatch, before_file=before_file)
-    assert remote_checkpoints(place) == names(*complete)
+    kill_during_upload(config_on("this", remote), reporter, monkeypatch, before_file=before_file)
+    assert remote_checkpoints(remote) == names(*complete)
     next_start = type(reporter)()
-    train(config_on(machine, place), next_start)
+    train(config_on(machine, remote), next_start)
     assert machine == "this" or next_start.steps[0] == max(complete, default=0) + 1
-    assert remote_checkpoints(place)[-1] == checkpoint_name(6)
+    assert remote_checkpoints(remote)[-1] == checkpoint_name(6)
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
     assert_same_run(whole_run, tmp_path / machine)
 
 
 def test_incomplete_remote_checkpoint_of_another_run_raises_before_the_first_step(
-    config_on, reporter, monkeypatch, tmp_path: Path, place: str
+    config_on, reporter, monkeypatch, tmp_path: Path, remote: str
 ) -> None:
-    die_in_upload(config_on("this", place), reporter, monkeypatch, before_file=2)
+    kill_during_upload(config_on("this", remote), reporter, monkeypatch, before_file=2)
     reporter.steps.clear()
     with pytest.raises(InputError, match=r"differs in training\.learning_rate.*Set another checkpoint.remote"):
-        train(config_on("other", place, training__learning_rate=0.5), reporter)
+        train(config_on("other", remote, training__learning_rate=0.5), reporter)
     assert not (tmp_path / "other").exists()
     assert reporter.steps == []
 
 
-def test_remote_small_files_without_a_checkpoint_do_not_block_a_new_run(config_on, reporter, place: str) -> None:
+def test_remote_small_files_without_a_checkpoint_do_not_block_a_new_run(config_on, reporter, remote: str) -> None:
     """After removing the remote checkpoints, a user can start a new run there, also with another config."""
-    train(config_on("this", place), reporter)
-    for name in remote_checkpoints(place):
-        RemoteCheckpoints(place).remove(name)
-    assert {"config.yaml", "run_id"} <= {name for name in SMALL_FILES if storage.exists(storage.join(place, name))}
-    train(config_on("other", place, training__learning_rate=0.5), reporter)
-    assert remote_checkpoints(place)[-1] == checkpoint_name(6)
+    train(config_on("this", remote), reporter)
+    for name in remote_checkpoints(remote):
+        RemoteCheckpoints(remote).remove(name)
+    assert {"config.yaml", "run_id"} <= {name for name in SMALL_FILES if storage.exists(storage.join(remote, name))}
+    train(config_on("other", remote, training__learning_rate=0.5), reporter)
+    assert remote_checkpoints(remote)[-1] == checkpoint_name(6)

@@ -1,4 +1,4 @@
-"""The base model of a run: found at a new path, and named for checkpoints of step 0."""
+"""The base model of a run is found at a new path; a checkpoint of step 0 is reported as the base model."""
 
 import shutil
 from collections.abc import Callable
@@ -80,9 +80,9 @@ def test_run_accepts_its_moved_base_model_and_no_other(
         load(run, [])
     with pytest.raises(InputError, match="an adapter trained on another predictor"):
         load(run, [f"model.base={another}"])
-    found = prediction(load(run, [f"model.base={base_folder}"]))
+    moved = prediction(load(run, [f"model.base={base_folder}"]))
     base = prediction(WorldModel.from_pretrained(base_folder))
-    assert not torch.allclose(found, base, atol=1e-4), "the adapter is on it"
+    assert not torch.allclose(moved, base, atol=1e-4), "the adapter must change the predictions"
 
 
 def test_other_overrides_raise_when_a_run_is_loaded(run: str, base_folder: Path) -> None:
@@ -112,9 +112,9 @@ STATE = "0.4,0,0.3,3.1,0,0.1,0.2"
 def test_missing_base_model_raises_with_the_command_for_a_new_path(
     run: str, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
-    words = command.replace("RUN", run).replace("STATE", STATE)
-    assert main(words.split()) == 2
-    assert f"run `vjepa2-ac {words} model.base=PATH`" in capsys.readouterr().err
+    arguments = command.replace("RUN", run).replace("STATE", STATE)
+    assert main(arguments.split()) == 2
+    assert f"run `vjepa2-ac {arguments} model.base=PATH`" in capsys.readouterr().err
 
 
 def test_resume_with_a_moved_base_model_stores_the_new_path(
@@ -139,7 +139,7 @@ FEW = EvaluationOptions(clips=3, probes=ProbeOptions(ranking_clips=0, examples=0
 
 
 def untrained_run(config: Config, *, newest: int = 6, rank: float | None = 0.1, widths: Widths | None = None) -> Path:
-    """Write a run of which step 0 is selected; its later checkpoint has the same weights."""
+    """Write a run whose selected checkpoint is step 0; the later checkpoint has the same weights."""
     return write_adapted_run(config, tuple(dict.fromkeys((0, newest))), 0, change=0.0, rank=rank, widths=widths)
 
 
@@ -149,7 +149,7 @@ def base_run(make_config: MakeConfig) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("changes", "how", "checkpoint", "note"),
+    ("changes", "run_options", "checkpoint", "note"),
     [
         ({}, {}, "selected", SELECTED),
         ({"adapter__kind": "none"}, {}, "selected", SELECTED),
@@ -176,20 +176,20 @@ def base_run(make_config: MakeConfig) -> Path:
     ],
 )  # fmt: skip
 def test_checkpoint_of_step_0_is_described_as_untrained(
-    make_config: MakeConfig, changes: dict[str, Any], how: dict[str, Any], checkpoint: str, note: str
+    make_config: MakeConfig, changes: dict[str, Any], run_options: dict[str, Any], checkpoint: str, note: str
 ) -> None:
-    found = load_subject(untrained_run(make_config(**changes), **how), checkpoint)
-    assert found.note == note
-    assert found.is_base == ("base model:" in note or "base model." in note)
+    subject = load_subject(untrained_run(make_config(**changes), **run_options), checkpoint)
+    assert subject.note == note
+    assert subject.is_base == ("base model:" in note or "base model." in note)
 
 
 def test_checkpoint_of_step_0_is_evaluated_once_as_base_model(base_run: Path, caplog: pytest.LogCaptureFixture) -> None:
-    measured = write_evaluation(evaluate_subject(str(base_run), FEW), base_run)
+    written = write_evaluation(evaluate_subject(str(base_run), FEW), base_run)
     assert caplog.messages == [SELECTED]
-    assert [(one.name, one.role) for one in measured.evaluation.models.values()] == [("base", "trained")]
-    assert SELECTED in measured.evaluation.notes
-    assert measured.summary.subject == f"{base_run}, step 0 (the base model)"
-    assert SELECTED in measured.report.read_text()
+    assert [(model.name, model.role) for model in written.evaluation.models.values()] == [("base", "trained")]
+    assert SELECTED in written.evaluation.notes
+    assert written.summary.subject == f"{base_run}, step 0 (the base model)"
+    assert SELECTED in written.report.read_text()
     metrics = read_metrics(base_run)
     assert (metrics.about.is_base, metrics.models, metrics.base) == (True, ("base",), None)
     export_run(base_run, base_run / "hub", "hub")

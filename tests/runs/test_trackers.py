@@ -15,8 +15,8 @@ from vjepa2_ac.runs.metrics_log import Trackers, open_trackers
 
 
 @pytest.fixture(autouse=True)
-def _own_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No tracker writes into the user's home, reports home, or knows the user's account."""
+def _isolated_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prevent trackers from writing into the user's home, sending telemetry, or using the user's account."""
     for name in ("HOME", "WANDB_CACHE_DIR", "WANDB_CONFIG_DIR", "WANDB_DATA_DIR", "TRACKIO_DIR"):
         monkeypatch.setenv(name, str(tmp_path / "home"))
     for name in ("WANDB_API_KEY", "WANDB_DIR", "WANDB_MODE", "WANDB_RUN_ID"):
@@ -62,11 +62,11 @@ class RecordingTracker:
             raise ConnectionError("the network is away")
 
 
-def failing() -> RecordingTracker:
+def raise_error() -> RecordingTracker:
     raise ConnectionError("the network is away")
 
 
-def leaving() -> RecordingTracker:
+def exit_process() -> RecordingTracker:
     raise SystemExit(3)
 
 
@@ -77,14 +77,14 @@ def warnings_in(caplog: pytest.LogCaptureFixture) -> list[str]:
 def test_trackers_receive_metrics_by_name_and_lists_as_numbers() -> None:
     recorder = RecordingTracker()
     trackers = Trackers({"one": lambda: recorder})
-    trackers.log("validation", 7, {"error": 0.5, "by_horizon": [1.0, 2.0], "nothing": float("nan"), "words": "no"})
+    trackers.log("validation", 7, {"error": 0.5, "by_horizon": [1.0, 2.0], "nothing": float("nan"), "text": "no"})
     trackers.close()
     assert recorder.rows == [
         (7, {"validation/error": 0.5, "validation/by_horizon/1": 1.0, "validation/by_horizon/2": 2.0})
     ]
 
 
-@pytest.mark.parametrize("opening", [failing, leaving])
+@pytest.mark.parametrize("opening", [raise_error, exit_process])
 def test_tracker_that_cannot_be_opened_causes_one_warning(caplog, opening: Callable[[], RecordingTracker]) -> None:
     recorder = RecordingTracker()
     trackers = Trackers({"bad": opening, "good": lambda: recorder})
@@ -104,10 +104,10 @@ def test_tracker_that_fails_later_causes_one_warning(caplog, fails_in: str) -> N
     trackers.close()
     assert len(good.rows) == 2
     assert good.closed == 1
-    (said,) = warnings_in(caplog)
-    assert said.startswith("bad ")
-    assert "ConnectionError: the network" in said
-    assert "\n" not in said
+    (warning,) = warnings_in(caplog)
+    assert warning.startswith("bad ")
+    assert "ConnectionError: the network" in warning
+    assert "\n" not in warning
 
 
 def test_tensorboard_receives_metrics_and_drops_repeated_steps(tmp_path: Path) -> None:
@@ -150,8 +150,8 @@ def test_resumed_run_continues_the_same_offline_wandb_run(tmp_path: Path) -> Non
     files = list((tmp_path / "wandb").glob("offline-run-*-abc123/run-abc123.wandb"))
     written = b"".join(path.read_bytes() for path in files)
     assert written.count(b"train/loss") >= 2
-    for word in (b"arms", b"training.learning_rate", b"adapter.rank"):
-        assert word in written
+    for text in (b"arms", b"training.learning_rate", b"adapter.rank"):
+        assert text in written
 
 
 def test_resumed_run_continues_the_same_trackio_run(tmp_path: Path) -> None:

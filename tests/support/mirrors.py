@@ -1,4 +1,4 @@
-"""Runs of small files with checkpoints, and the places that they are mirrored to."""
+"""Runs with small checkpoints, and the remote folders to which they are copied."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,11 +7,11 @@ from vjepa2_ac import storage
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, write_checkpoint
 from vjepa2_ac.runs.mirror import RemoteCheckpoints, list_complete
 
-PLACE = "gs://bucket/run"
+REMOTE = "gs://bucket/run"
 
 
 def write(run: Path, step: int, state: RunState | None = None, keep: int = 3, words: str = "of step") -> Path:
-    """Write a checkpoint of two files; its state is of the run `mine` where it names none."""
+    """Write a checkpoint with two files besides the state; the run id is `mine` if the state has none."""
 
     def files(folder: Path) -> None:
         (folder / "adapter").mkdir()
@@ -22,15 +22,15 @@ def write(run: Path, step: int, state: RunState | None = None, keep: int = 3, wo
     return write_checkpoint(run / "checkpoints", replace(state, run_id=state.run_id or "mine"), files, keep=keep)
 
 
-def remote_checkpoints(place: str = PLACE) -> list[str]:
+def remote_checkpoints(remote: str = REMOTE) -> list[str]:
     """Return the names of the complete checkpoints in a remote folder."""
-    return sorted(list_complete(RemoteCheckpoints(place).list_files()))
+    return sorted(list_complete(RemoteCheckpoints(remote).list_files()))
 
 
 def names(*steps: int) -> list[str]:
     return [checkpoint_name(step) for step in steps]
 
 
-def content(place: str | Path) -> dict[str, bytes]:
-    """Return all files of a place or folder."""
-    return {name: storage.read_bytes(storage.join(str(place), name)) for name in storage.file_sizes(str(place))}
+def content(folder: str | Path) -> dict[str, bytes]:
+    """Return the content of all files in a remote or local folder."""
+    return {name: storage.read_bytes(storage.join(str(folder), name)) for name in storage.file_sizes(str(folder))}

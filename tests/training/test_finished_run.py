@@ -77,9 +77,9 @@ def test_finished_run_starts_again_with_more_steps_or_other_paths(
 
 def test_extended_run_reports_its_learning_rate(make_config: MakeConfig, run: Path, reporter: SilentReporter) -> None:
     train(make_config(run_dir=run, training__steps=13, validation__every=100), reporter, allow_config_change=True)
-    said = [note for note in reporter.notes if note.startswith("The learning rate")]
+    rate_notes = [note for note in reporter.notes if note.startswith("The learning rate")]
     rate = next(row["learning_rate"] for row in metrics(run) if row["kind"] == "train" and row["step"] == 7)
     assert rate == pytest.approx(1e-3 / 2)
-    (line,) = said
+    (line,) = rate_notes
     assert line.startswith("The learning rate continues at 5.0e-04 (it had reached 0 at step 6). ")
     assert "training.steps: 6 -> 13" in "".join(reporter.notes)

@@ -1,4 +1,4 @@
-"""FLOP formulas equal PyTorch's counter for a tiny model, and nearly the known values of the real one."""
+"""FLOP formulas equal PyTorch's counter for a tiny model, and approximately the known values of the released model."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ ADAPTERS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def counted(config: Config, clips: int = 2) -> tuple[int, int]:
+def count_flops(config: Config, clips: int = 2) -> tuple[int, int]:
     """Return PyTorch's FLOP counts for one clip: forward and backward pass."""
     model = built(config, SIZES)
     frames, objective = config.data.frames, Objective(model, config.training)
@@ -37,7 +37,7 @@ def counted(config: Config, clips: int = 2) -> tuple[int, int]:
         latents=torch.randn(clips, frames, model.num_tokens, model.latent_dim), states=torch.randn(clips, frames, 7),
         actions=torch.randn(clips, frames - 1, 7), extrinsics=None, episode_ids=("a",) * clips, starts=(0,) * clips,
     )  # fmt: skip
-    with sdpa_kernel(SDPBackend.MATH):  # the one kernel of a CPU whose products are counted
+    with sdpa_kernel(SDPBackend.MATH):  # the only CPU kernel whose matrix products PyTorch counts
         with FlopCounterMode(display=False) as forward:
             loss = sum(objective(batch))
         with FlopCounterMode(display=False) as backward:
@@ -49,7 +49,7 @@ def counted(config: Config, clips: int = 2) -> tuple[int, int]:
 def test_clip_flops_equal_pytorchs_counter(adapter: str) -> None:
     config = run_config(ADAPTERS[adapter], training__rollout_steps=3, model__dtype="float32")
     flops = clip_flops(config, SIZES)
-    assert (flops.forward, flops.backward) == counted(config)
+    assert (flops.forward, flops.backward) == count_flops(config)
 
 
 def test_frame_flops_equal_pytorchs_counter() -> None:

@@ -46,26 +46,28 @@ def test_run_with_image_strips_equals_a_run_without_bit_for_bit(
     assert names(run) == STRIPS
     assert [(kind, name, step) for kind, name, step, _ in sent] == [("validation", "imagined", n) for n in (0, 3, 6)]
     assert np.array_equal(read_image(run / "imagined" / STRIPS[1]), sent[1][3])
-    assert not np.array_equal(sent[0][3][60:], sent[2][3][60:]), "the model has learned something"
+    assert not np.array_equal(sent[0][3][60:], sent[2][3][60:]), "training must change the predicted frames"
 
 
 def test_strip_shows_the_clip_with_the_most_motion(make_config, reporter, decoder) -> None:
     run = set_up(make_config(validation__decoder=decoder), reporter)
     validate(run, reporter)
     assert run.image_strip is not None
-    found = run.image_strip.rollout(run.world_model, run.accelerator.device, "run")
+    strip = run.image_strip.rollout(run.world_model, run.accelerator.device, "run")
     windows = validation_windows(run.dataset, "validation", clips=4)
-    moved = {}
+    distances = {}
     for episode, start in windows:
         states = run.dataset.source.read(episode, None).states[start : start + run.dataset.config.clip_steps : 2, :3]
-        moved[run.dataset.table.identity(episode), start] = np.linalg.norm(np.diff(states, axis=0), axis=1).sum()
-    assert (found.episode_id, found.start) == max(moved, key=lambda name: moved[name])
-    assert [(one.model, one.name, len(one.frames)) for one in found.rollouts] == [
+        distances[run.dataset.table.identity(episode), start] = np.linalg.norm(np.diff(states, axis=0), axis=1).sum()
+    assert (strip.episode_id, strip.start) == max(distances, key=lambda name: distances[name])
+    assert [(rollout.model, rollout.name, len(rollout.frames)) for rollout in strip.rollouts] == [
         ("base", AS_RECORDED, 3), ("model now", AS_RECORDED, 3),
     ]  # fmt: skip
-    assert np.array_equal(found.rollouts[0].frames, found.rollouts[1].frames), "a fresh adapter changes nothing"
-    assert found.truth is not None
-    assert found.truth.shape == (3, 32, 32, 3)
+    assert np.array_equal(strip.rollouts[0].frames, strip.rollouts[1].frames), (
+        "a new adapter must not change predictions"
+    )
+    assert strip.truth is not None
+    assert strip.truth.shape == (3, 32, 32, 3)
 
 
 @pytest.mark.parametrize("failing", ["frames_for_display", "write_atomically"])

@@ -1,4 +1,4 @@
-"""Properties of the loop: exact, resumable, and only the adapter changes."""
+"""Properties of the training loop: exact resume, gradient accumulation, checks, and allowed config changes."""
 
 import json
 import shutil
@@ -31,20 +31,20 @@ def test_resumed_run_equals_an_uninterrupted_run(make_config, reporter, tmp_path
     assert_same_run(whole_run, tmp_path / "broken")
 
 
-KINDS = {
+MODES = {
     "dora": {"adapter__dora": True, "adapter__dropout": 0.2},
     "whole predictor": {"adapter__kind": "none"},
     "8 bit": {"training__optimizer": "adamw_8bit"},
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("mode", MODES)
 def test_resumed_run_equals_an_uninterrupted_run_for_each_training_mode(
-    make_config, reporter, tmp_path, kind: str
+    make_config, reporter, tmp_path, mode: str
 ) -> None:
-    if kind == "8 bit":
+    if mode == "8 bit":
         pytest.importorskip("bitsandbytes")
-    changes = {"training__steps": 4, **KINDS[kind]}
+    changes = {"training__steps": 4, **MODES[mode]}
     train(make_config(run_dir=str(tmp_path / "whole"), **changes), reporter)
     config = make_config(run_dir=str(tmp_path / "broken"), **changes)
     with pytest.raises(KilledError):
@@ -62,13 +62,13 @@ def test_number_of_loader_workers_does_not_change_a_run(make_config, reporter, t
 
 
 def test_best_checkpoint_by_validation_is_saved_and_kept(make_config, reporter, tmp_path, monkeypatch) -> None:
-    def measured(errors: object) -> dict:
+    def next_metrics(errors: object) -> dict:
         del errors
         return {"rollout_over_persistence_last": next(values)}
 
-    monkeypatch.setattr(validation, "validation_metrics", measured)
+    monkeypatch.setattr(validation, "validation_metrics", next_metrics)
     config = make_config(validation__every=1, checkpoint__every=100, checkpoint__keep=1, checkpoint__keep_best="error")
-    values = iter([0.95, 0.9, 0.7, 0.8, 0.75])  # the first is the base's
+    values = iter([0.95, 0.9, 0.7, 0.8, 0.75])  # the first error is the base model's
     with pytest.raises(KilledError):
         train(config, dying_reporter(type(reporter)(), 5))
     values = iter([0.71, 0.8, 0.9, 0.72])
@@ -114,7 +114,7 @@ def test_base_model_not_better_than_persistence_raises(make_config, reporter) ->
     with pytest.raises(InputError, match="copying the last frame"):
         train(config, reporter)
     assert reporter.steps == []
-    assert not Path(config.run_dir).exists(), "the config can be mended and tried again"
+    assert not Path(config.run_dir).exists(), "a corrected config must be able to use the folder"
 
 
 def test_check_runs_all_checks_and_writes_nothing(make_config, reporter) -> None:
@@ -155,14 +155,14 @@ def test_allowed_changes_of_the_optimizer_take_effect(make_config, reporter) -> 
 def test_run_resumes_with_moved_data_and_refuses_other_data(make_config, reporter, tmp_path, data_folder) -> None:
     folder = train(make_config(training__steps=2), reporter)
     for name in ("moved", "others"):
-        shutil.copytree(data_folder, tmp_path / name)  # with the times of the files
+        shutil.copytree(data_folder, tmp_path / name)  # copies the modification times of the files
     train(make_config(training__steps=2, data__path=str(tmp_path / "moved")), reporter)
-    assert read_run_config(folder).data.path == str(tmp_path / "moved"), "whoever evaluates it finds the data"
+    assert read_run_config(folder).data.path == str(tmp_path / "moved"), "later commands must find the moved data"
     next((tmp_path / "others").rglob("*.tfrecord*")).touch()
-    others = make_config(training__steps=2, data__path=str(tmp_path / "others"))
+    other_config = make_config(training__steps=2, data__path=str(tmp_path / "others"))
     with pytest.raises(InputError, match=r"others: episodes or files that differ from those of the run.*moved\."):
-        train(others, type(reporter)())
-    train(others, type(reporter)(), allow_config_change=True)
+        train(other_config, type(reporter)())
+    train(other_config, type(reporter)(), allow_config_change=True)
 
 
 def test_bf16_run_keeps_trained_weights_in_float32(make_config: object, reporter) -> None:
@@ -175,20 +175,20 @@ def test_resumed_run_remembers_broken_episodes(make_config, reporter, monkeypatc
     read, config = loader.read_clip, make_config(training__steps=2, data__broken_episodes="skip")
     bad = next(iterate_batches(set_up(config, reporter))).episode_ids[0]
 
-    def read_some(dataset: Dataset, wish: ClipRequest) -> Clip:
-        if dataset.table.identity(wish.episode) == bad:
+    def read_clip_or_raise(dataset: Dataset, request: ClipRequest) -> Clip:
+        if dataset.table.identity(request.episode) == bad:
             raise InputError(where="here", found="damaged")
-        return read(dataset, wish)
+        return read(dataset, request)
 
-    monkeypatch.setattr(loader, "read_clip", read_some)
+    monkeypatch.setattr(loader, "read_clip", read_clip_or_raise)
     train(config, reporter)
     monkeypatch.setattr(loader, "read_clip", read)
     assert set_up(config, reporter).dataset.broken.reasons == {bad: "here: damaged."}
 
 
 def test_checkpoint_is_saved_at_the_time_limit(make_config, reporter, tmp_path, monkeypatch) -> None:
-    for seconds, written in ((0.0, [1, 2, 3]), (3600.0, [3])):
+    for seconds, saved_steps in ((0.0, [1, 2, 3]), (3600.0, [3])):
         monkeypatch.setattr(outputs, "SAVE_EVERY_S", seconds)
         keys = {"run_dir": tmp_path / str(seconds), "checkpoint__every": 100, "checkpoint__keep_best": "off"}
         run = train(make_config(training__steps=3, **keys), reporter)
-        assert sorted(int(path.name.split("-")[1]) for path in (run / "checkpoints").glob("step-*")) == written
+        assert sorted(int(path.name.split("-")[1]) for path in (run / "checkpoints").glob("step-*")) == saved_steps

@@ -59,21 +59,21 @@ def test_other_distances_equal_pytorch(keys: dict[str, Any]) -> None:
     model, batch, _ = official("tiny")
     with torch.no_grad():
         forced = model.predict(batch.latents[:, :-1], batch.actions, batch.states[:, :-1])
-        found, _ = Objective(model, TrainingConfig.model_validate(keys))(batch)
+        loss, _ = Objective(model, TrainingConfig.model_validate(keys))(batch)
     true = batch.latents[:, 1:]
     expected = smooth_l1_loss(forced, true, beta=0.25) if keys["loss"] != "l2" else (forced - true).square().mean()
-    assert found.item() == pytest.approx(expected.item(), rel=1e-5)
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("keys", "complaint"),
+    ("keys", "message"),
     [
         ({"loss": "huber"}, "no loss has this name"),
         ({"loss": {"name": "l1", "options": {"beta": 0.5}}}, "no options of its own"),
     ],
 )
-def test_invalid_loss_options_raise(keys: dict[str, object], complaint: str) -> None:
-    with pytest.raises(ValidationError, match=complaint):
+def test_invalid_loss_options_raise(keys: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
         TrainingConfig.model_validate(keys)
 
 
@@ -105,11 +105,11 @@ def plain_losses(model: WorldModel, batch: LatentBatch, steps: int) -> tuple[Ten
         cameras = None if batch.extrinsics is None else batch.extrinsics[:, :time]
         return model.predict(latents, batch.actions[:, :time], batch.states[:, :time], cameras)
 
-    seen = batch.latents[:, :1]
+    latents_so_far = batch.latents[:, :1]
     for time in range(1, steps + 1):
-        seen = torch.cat([seen, predict(seen, time)[:, -1:]], dim=1)
+        latents_so_far = torch.cat([latents_so_far, predict(latents_so_far, time)[:, -1:]], dim=1)
     forced = predict(batch.latents[:, :-1], FRAMES - 1)
-    pairs = ((forced, batch.latents[:, 1:]), (seen[:, 1:], batch.latents[:, 1 : steps + 1]))
+    pairs = ((forced, batch.latents[:, 1:]), (latents_so_far[:, 1:], batch.latents[:, 1 : steps + 1]))
     return tuple((predicted - true).abs().mean() for predicted, true in pairs)  # type: ignore[return-value]
 
 
@@ -126,17 +126,17 @@ def test_losses_and_gradients_equal_those_without_key_value_cache(
     monkeypatch: pytest.MonkeyPatch, steps: int, adapter: AdapterConfig, checkpointing: bool, extrinsics: bool
 ) -> None:
     # Float64 throughout: otherwise predictions are normalised in float32.
-    monkeypatch.setattr(predictor, "normalise_latents", lambda found: layer_norm(found, found.shape[-1:]))
+    monkeypatch.setattr(predictor, "normalise_latents", lambda latents: layer_norm(latents, latents.shape[-1:]))
     model = trained_model(adapter, extrinsics=extrinsics, checkpointing=checkpointing).double()
     batch = clips(extrinsics=extrinsics)
     tensors = {name: value.double() for name, value in vars(batch).items() if isinstance(value, Tensor)}
     batch = replace(batch, **tensors)
     distance = lambda predicted, true: (predicted - true).abs()  # noqa: E731
-    found = with_gradients(model, prediction_losses(model, batch, steps, distance))
+    actual = with_gradients(model, prediction_losses(model, batch, steps, distance))
     expected = with_gradients(model, plain_losses(model, batch, steps))
-    for one, other in zip(found, expected, strict=True):
-        assert other.any()
-        assert (one - other).norm() <= 1e-12 * other.norm()  # 2e-14 was measured
+    for value, reference in zip(actual, expected, strict=True):
+        assert reference.any()
+        assert (value - reference).norm() <= 1e-12 * reference.norm()  # 2e-14 was measured
 
 
 def test_dropout_mask_of_teacher_forcing_does_not_depend_on_the_rollout() -> None:

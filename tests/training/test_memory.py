@@ -28,7 +28,9 @@ def bytes_of_moments(**changes: object) -> tuple[int, int]:
         tensor.data_ptr(): tensor.nbytes
         for state in optimizer.state.values()
         for name, tensor in state.items()
-        if isinstance(tensor, torch.Tensor) and name != "step" and not name.startswith("qmap")  # one table for all
+        if isinstance(tensor, torch.Tensor)
+        and name != "step"
+        and not name.startswith("qmap")  # a table that all tensors share
     }
     return estimate_memory(config, sizes).parts["optimizer state"], sum(tensors.values())
 
@@ -113,8 +115,8 @@ def test_parameter_counts_equal_those_of_a_built_model(shape: str, adapter: str)
     counts, report = count_parameters(config, sizes), trainable_report(model)
     assert (counts.predictor, counts.encoder) == (report.predictor, report.total - report.predictor)
     assert counts.trained == report.trained
-    found = sorted(value.numel() for value in model.parameters() if value.requires_grad)
-    assert sorted(counts.trained_tensors) == found
+    trained_sizes = sorted(value.numel() for value in model.parameters() if value.requires_grad)
+    assert sorted(counts.trained_tensors) == trained_sizes
 
 
 def test_parameter_counts_of_the_released_model() -> None:

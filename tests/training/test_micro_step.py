@@ -43,13 +43,13 @@ class Recorder:
         return [None if weight.grad is None else weight.grad.data_ptr() for weight in self.run.trained]
 
 
-def uneven(batches: Iterator[Batch]) -> Iterator[Batch]:
-    """Remove unreadable clips: all but one of the third micro-batch, all of the fifth."""
+def skip_some_clips(batches: Iterator[Batch]) -> Iterator[Batch]:
+    """Simulate unreadable clips: all but one clip of the third micro-batch, and all clips of the fifth."""
     for number, batch in enumerate(batches):
         yield some_clips(batch, list(range({2: 1, 4: 0}.get(number, len(batch.starts)))))
 
 
-def learned(run: Run, batches: Iterator[Batch]) -> list[Tensor]:
+def train_steps(run: Run, batches: Iterator[Batch]) -> list[Tensor]:
     metrics = [training_step(run, batches, step) for step in range(1, STEPS + 1)]
     losses = torch.tensor([[row["loss"], row["grad_norm"]] for row in metrics], dtype=torch.float64)
     return [losses, *(parameter.detach().clone() for parameter in run.trained)]
@@ -67,29 +67,29 @@ def make_run(make_config: Callable[..., Config], reporter) -> Callable[..., Run]
     return make
 
 
-def recorded(run: Run) -> Recorder:
+def record_micro_step(run: Run) -> Recorder:
     """Make a run capture its micro-step with a `Recorder`, on any device."""
     recorder = Recorder(run)
     run.micro_step = GraphedMicroStep(recorder)
     return recorder
 
 
-@pytest.mark.parametrize("order", [lambda batches: batches, uneven], ids=["even", "uneven"])
+@pytest.mark.parametrize("order", [lambda batches: batches, skip_some_clips], ids=["even", "uneven"])
 def test_training_with_a_captured_micro_step_equals_training_without(make_run, order) -> None:
-    plain, other = (make_run() for _ in range(2))
-    expected = learned(plain, order(iterate_batches(plain)))
-    recorder = recorded(other)
-    found = learned(other, order(iterate_batches(other)))
-    assert all(map(torch.equal, found, expected))
+    plain, captured = (make_run() for _ in range(2))
+    expected = train_steps(plain, order(iterate_batches(plain)))
+    recorder = record_micro_step(captured)
+    actual = train_steps(captured, order(iterate_batches(captured)))
+    assert all(map(torch.equal, actual, expected))
     assert recorder.captures == 1
-    assert recorder.replays == 2 * STEPS - (2 if order is uneven else 0)
+    assert recorder.replays == 2 * STEPS - (2 if order is skip_some_clips else 0)
 
 
 def test_capture_adds_to_existing_gradients(make_run) -> None:
     run = make_run()
     run.world_model.train()
     first, second = (encode(run, batch) for batch in itertools.islice(iterate_batches(run), 2))
-    recorder = recorded(run)
+    recorder = record_micro_step(run)
 
     def gradients(*steps: Callable[..., Tensor]) -> list[Tensor]:
         run.optimizer.zero_grad()
@@ -105,10 +105,10 @@ def test_capture_adds_to_existing_gradients(make_run) -> None:
 @NEEDS_CUDA
 def test_training_with_a_cuda_graph_equals_training_without(make_run) -> None:
     runs = [make_run(training__device="cuda", training__cuda_graph=graph) for graph in (False, True)]
-    expected, found = (learned(run, iterate_batches(run)) for run in runs)
+    expected, actual = (train_steps(run, iterate_batches(run)) for run in runs)
     assert isinstance(runs[1].micro_step, GraphedMicroStep)
-    for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
+    for value, reference in zip(actual, expected, strict=True):
+        torch.testing.assert_close(value, reference, rtol=1e-3, atol=1e-5)
 
 
 def test_cuda_graph_on_a_cpu_raises(make_config) -> None:

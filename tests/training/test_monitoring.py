@@ -41,7 +41,9 @@ def test_throughput_counts_clips_tokens_and_flops_per_second() -> None:
     usable = replace(throughput, ceiling=2 * mfu * throughput.ceiling)
     assert usable.compute_metrics(clips=12.0, seconds=4.0, waited_s=1.0)["mfu"] == pytest.approx(0.5)
     unusable = replace(throughput, ceiling=mfu * throughput.ceiling / 7)
-    assert math.isnan(unusable.compute_metrics(clips=12.0, seconds=4.0, waited_s=1.0)["mfu"]), "700 % is no utilisation"
+    assert math.isnan(unusable.compute_metrics(clips=12.0, seconds=4.0, waited_s=1.0)["mfu"]), (
+        "a utilisation of 700 % is not valid"
+    )
     assert metrics["ceiling_tflops"] == pytest.approx(2 * speed / 1e12)
     assert metrics.keys() == MACHINE_METRICS
 
@@ -58,7 +60,7 @@ def test_training_rows_contain_run_and_machine_metrics(make_config, reporter) ->
         assert 0 < row["update_to_weight"] < 1
         assert 0 < row["data_wait_share"] < 1
         assert row["mfu"] is None or 0 < row["mfu"] <= 1, "a busy machine may have no usable ceiling"
-    assert "update_to_weight" not in stepped[1], "it needs a copy of the weights"
+    assert "update_to_weight" not in stepped[1], "steps that are not logged must not copy the weights"
     assert not any("mfu" in note for note in reporter.notes)
 
 
@@ -72,11 +74,11 @@ def validation(one_step: float, rollout: float | None = None) -> dict[str, float
     }
 
 
-def warned(config: Config, *rows: tuple[int, dict[str, Any]]) -> dict[int, str]:
+def collect_warnings(config: Config, *rows: tuple[int, dict[str, Any]]) -> dict[int, str]:
     """Return the warnings of validations, by step."""
-    watch = DivergenceDetector(config)
-    found = {step: watch("validation", step, metrics) for step, metrics in rows}
-    return {step: text for step, text in found.items() if text}
+    detector = DivergenceDetector(config)
+    warnings = {step: detector("validation", step, metrics) for step, metrics in rows}
+    return {step: text for step, text in warnings.items() if text}
 
 
 @pytest.fixture
@@ -85,9 +87,11 @@ def config(make_config: Callable[..., Config]) -> Config:
 
 
 def test_validation_worse_than_the_base_model_is_reported_once(config: Config) -> None:
-    found = warned(config, (0, validation(0.8)), (3, validation(0.85)), (6, validation(0.86)), (9, validation(0.7)))
-    assert list(found) == [3]
-    text = found[3]
+    warnings = collect_warnings(
+        config, (0, validation(0.8)), (3, validation(0.85)), (6, validation(0.86)), (9, validation(0.7))
+    )
+    assert list(warnings) == [3]
+    text = warnings[3]
     assert (
         "at step 3 the one-step error in validation is 0.850 of persistence's (before training 0.800); the rollout"
         in text
@@ -96,12 +100,12 @@ def test_validation_worse_than_the_base_model_is_reported_once(config: Config) -
 
 
 def test_loss_far_above_its_minimum_is_reported(config: Config) -> None:
-    watch = DivergenceDetector(config)
+    detector = DivergenceDetector(config)
     losses = [0.3, 0.5, 0.3, 0.4, 0.3] * 4 + [0.9] * 20
-    found = {step: texts for step, loss in enumerate(losses) if (texts := watch("train", step, {"loss": loss}))}
-    (step,) = found
+    warnings = {step: texts for step, loss in enumerate(losses) if (texts := detector("train", step, {"loss": loss}))}
+    (step,) = warnings
     assert 20 < step < 30
-    assert "the loss is 0.7, its minimum was 0.3 (medians of 10 rows)" in found[step]
+    assert "the loss is 0.7, its minimum was 0.3 (medians of 10 rows)" in warnings[step]
 
 
 def ranking(rank: float, low: float, high: float) -> dict[str, float]:
@@ -110,16 +114,16 @@ def ranking(rank: float, low: float, high: float) -> dict[str, float]:
 
 def test_better_prediction_with_worse_ranking_is_reported_once(config: Config) -> None:
     start = validation(0.9) | ranking(0.03, 0.02, 0.04)
-    unsure, sure = validation(0.7) | ranking(0.05, 0.039, 0.07), validation(0.6) | ranking(0.06, 0.05, 0.07)
-    found = warned(config, (0, start), (3, unsure), (6, sure), (9, sure))
-    assert list(found) == [6]
-    assert "the action-ranking error is 6.0 % (before training 3.0 %, chance 50 %), although" in found[6]
+    overlapping, separate = validation(0.7) | ranking(0.05, 0.039, 0.07), validation(0.6) | ranking(0.06, 0.05, 0.07)
+    warnings = collect_warnings(config, (0, start), (3, overlapping), (6, separate), (9, separate))
+    assert list(warnings) == [6]
+    assert "the action-ranking error is 6.0 % (before training 3.0 %, chance 50 %), although" in warnings[6]
     worse = validation(0.95) | ranking(0.06, 0.05, 0.07)
-    assert "although" not in warned(config, (0, start), (3, worse))[3]
+    assert "although" not in collect_warnings(config, (0, start), (3, worse))[3]
 
 
 def test_warning_is_logged_and_not_repeated_after_a_resume(config: Config, reporter) -> None:
-    for step, one_step in ((0, 0.8), (3, 0.85), (6, 0.86)):  # each in a process of its own
+    for step, one_step in ((0, 0.8), (3, 0.85), (6, 0.86)):  # each as in a new process
         trackers = open_trackers(config, Path(config.run_dir), run_id="a", first_step=step)
         with DivergenceWarningLog(config, reporter, first_step=step, trackers=trackers) as log:
             log.write("validation", step, validation(one_step))

@@ -26,7 +26,7 @@ def test_warmup_stable_decay_equals_the_official_schedule() -> None:
         learning_rate=expected["peak_lr"],
         schedule="warmup_stable_decay",
     )
-    first = training.warmup_steps  # the official warm-up begins above 0, ours at 0
+    first = training.warmup_steps  # the official warm-up starts above 0, this one at 0
     rates = [learning_rate_at(step, training) for step in range(first, 201)]
     assert rates == pytest.approx(expected["lr_at_step_1_to_200"][first - 1 :], rel=1e-9, abs=1e-15)
 
@@ -34,8 +34,8 @@ def test_warmup_stable_decay_equals_the_official_schedule() -> None:
 @pytest.mark.parametrize(("schedule", "middle", "end"), [("cosine", 5e-4, 0.0), ("warmup_stable_decay", 1e-3, 1e-3)])
 def test_schedule_warms_up_linearly_and_decays_to_the_end(schedule: str, middle: float, end: float) -> None:
     training = TrainingConfig(steps=100, warmup_steps=10, learning_rate=1e-3, schedule=schedule)
-    found = [learning_rate_at(step, training) for step in (5, 10, 55, 100)]
-    assert found == pytest.approx([5e-4, 1e-3, middle, end])
+    selected_rates = [learning_rate_at(step, training) for step in (5, 10, 55, 100)]
+    assert selected_rates == pytest.approx([5e-4, 1e-3, middle, end])
     rates = [learning_rate_at(step, training) for step in range(10, 101)]
     assert rates == sorted(rates, reverse=True)
 
@@ -78,17 +78,17 @@ def test_resume_converts_moments_between_fused_and_plain_optimizer(
         take_steps(module, optimizer, range(3))
         fuse(after)
         resumed.load_state_dict(module.state_dict())
-        again = make_optimizer(resumed, training)
-        load_moments(again, moments_of(optimizer))
-        assert [bool(group["fused"]) for group in again.param_groups] == [after, after]
-        assert again.state_dict()["state"].keys() == optimizer.state_dict()["state"].keys()
+        resumed_optimizer = make_optimizer(resumed, training)
+        load_moments(resumed_optimizer, moments_of(optimizer))
+        assert [bool(group["fused"]) for group in resumed_optimizer.param_groups] == [after, after]
+        assert resumed_optimizer.state_dict()["state"].keys() == optimizer.state_dict()["state"].keys()
         for index, state in optimizer.state_dict()["state"].items():
             for name, value in state.items():
-                found = again.state_dict()["state"][index][name]
-                assert found.dtype == value.dtype
-                assert torch.equal(found, value)
-        take_steps(resumed, again, range(3, 6))
-        assert all(state["step"] == 6 for state in again.state.values())
+                restored = resumed_optimizer.state_dict()["state"][index][name]
+                assert restored.dtype == value.dtype
+                assert torch.equal(restored, value)
+        take_steps(resumed, resumed_optimizer, range(3, 6))
+        assert all(state["step"] == 6 for state in resumed_optimizer.state.values())
         weights.append(resumed.weight)
     torch.testing.assert_close(weights[1], weights[0], rtol=1e-5, atol=1e-7)
 

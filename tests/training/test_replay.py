@@ -31,7 +31,7 @@ def second(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def replaying(make_config, second: Path):
+def make_replay_config(make_config, second: Path):
     """Return a config of a run that replays the second data set."""
 
     def make(share: float = 0.25, **changes: object) -> Config:
@@ -47,10 +47,10 @@ def names(batches: list[Batch]) -> Names:
     return [name for batch in batches for name in zip(batch.episode_ids, batch.starts, strict=True)]
 
 
-def clips_of(config: Config, count: int, **options: object) -> Names:
-    first, replayed = (open_dataset(one) for one in config.data_sets)
-    chosen = {"seed": 1, "batch_size": 4, **options}
-    batches = training_loader(MixedDataset(first, replayed, config.replay.share), **chosen)
+def draw_clips(config: Config, count: int, **options: object) -> Names:
+    first, replayed = (open_dataset(data) for data in config.data_sets)
+    loader_options = {"seed": 1, "batch_size": 4, **options}
+    batches = training_loader(MixedDataset(first, replayed, config.replay.share), **loader_options)
     return names(list(itertools.islice(batches, count)))
 
 
@@ -58,24 +58,26 @@ def is_replayed(name: tuple[str, int]) -> bool:
     return int(name[0].split("episode_")[1][:4]) >= 100
 
 
-def test_replay_share_is_exact_and_the_order_of_each_data_set_is_unchanged(replaying) -> None:
-    config = replaying(0.6)
-    found = clips_of(config, 25)
-    assert sum(map(is_replayed, found)) == 60
+def test_replay_share_is_exact_and_the_order_of_each_data_set_is_unchanged(make_replay_config) -> None:
+    config = make_replay_config(0.6)
+    drawn = draw_clips(config, 25)
+    assert sum(map(is_replayed, drawn)) == 60
     for data, replayed in zip(config.data_sets, (False, True), strict=True):
-        own = [name for name in found if is_replayed(name) == replayed]
-        alone = names(list(itertools.islice(training_loader(open_dataset(data), seed=1, batch_size=1), len(own))))
-        assert own == alone
+        drawn_from_data = [name for name in drawn if is_replayed(name) == replayed]
+        alone = names(
+            list(itertools.islice(training_loader(open_dataset(data), seed=1, batch_size=1), len(drawn_from_data)))
+        )
+        assert drawn_from_data == alone
 
 
-def test_resumed_run_with_replay_equals_an_uninterrupted_run(replaying, reporter, tmp_path) -> None:
+def test_resumed_run_with_replay_equals_an_uninterrupted_run(make_replay_config, reporter, tmp_path) -> None:
     changes = {
         "training__steps": 4, "data__cache": "auto",
         "replay__data__cache": "auto", "data__cache_dir": str(tmp_path / "a"),
         "replay__data__cache_dir": str(tmp_path / "b"),
     }  # fmt: skip
-    train(replaying(run_dir=str(tmp_path / "whole"), **changes), reporter)
-    config = replaying(run_dir=str(tmp_path / "broken"), **changes)
+    train(make_replay_config(run_dir=str(tmp_path / "whole"), **changes), reporter)
+    config = make_replay_config(run_dir=str(tmp_path / "broken"), **changes)
     with pytest.raises(KilledError):
         train(config, dying_reporter(type(reporter)(), 3))
     train(config, reporter)
@@ -86,11 +88,11 @@ def test_resumed_run_with_replay_equals_an_uninterrupted_run(replaying, reporter
     assert state.data[1].windows == len(open_dataset(config.replay.data).windows("train"))
 
 
-def test_unreadable_clip_counts_for_its_data_set(replaying, monkeypatch) -> None:
-    config = replaying(0.5, data__broken_episodes="skip", replay__data__broken_episodes="skip")
-    first, replayed = (open_dataset(one) for one in config.data_sets)
-    for one in (first, replayed):
-        monkeypatch.setattr(one.broken, "_episodes", 1_000)
+def test_unreadable_clip_is_recorded_in_the_data_set_that_contains_it(make_replay_config, monkeypatch) -> None:
+    config = make_replay_config(0.5, data__broken_episodes="skip", replay__data__broken_episodes="skip")
+    first, replayed = (open_dataset(data) for data in config.data_sets)
+    for dataset in (first, replayed):
+        monkeypatch.setattr(dataset.broken, "_episodes", 1_000)
     read = loader.read_clip
 
     def broken(dataset, request):
@@ -99,18 +101,18 @@ def test_unreadable_clip_counts_for_its_data_set(replaying, monkeypatch) -> None
         return read(dataset, request)
 
     monkeypatch.setattr(loader, "read_clip", broken)
-    found = list(itertools.islice(training_loader(MixedDataset(first, replayed, 0.5), seed=1, batch_size=2), 4))
-    assert [len(batch.starts) for batch in found] == [1, 1, 1, 1]
+    batches = list(itertools.islice(training_loader(MixedDataset(first, replayed, 0.5), seed=1, batch_size=2), 4))
+    assert [len(batch.starts) for batch in batches] == [1, 1, 1, 1]
     assert not first.broken.reasons
     assert replayed.broken.reasons
     assert all(is_replayed((name, 0)) for name in replayed.broken.reasons)
 
 
-# ---- what does not fit ----
+# ---- incompatible data sets ----
 
 
 @pytest.mark.parametrize(
-    ("changes", "complaint"),
+    ("changes", "message"),
     [
         ({"replay__data__frames": 5}, r"replay.data.frames 5 differs from data.frames 4"),
         ({"replay__data__states": "vector"}, r"replay.data.states vector differs from data.states pose"),
@@ -120,9 +122,9 @@ def test_unreadable_clip_counts_for_its_data_set(replaying, monkeypatch) -> None
         ({"replay__data__nonsense": 1}, r"replay.data.nonsense: unknown key"),
     ],
 )
-def test_incompatible_replay_data_set_raises_when_the_config_is_parsed(replaying, changes, complaint) -> None:
-    with pytest.raises(InputError, match=complaint):
-        replaying(**changes)
+def test_incompatible_replay_data_set_raises_when_the_config_is_parsed(make_replay_config, changes, message) -> None:
+    with pytest.raises(InputError, match=message):
+        make_replay_config(**changes)
 
 
 def test_replay_data_set_inherits_settings_and_writes_differences(tmp_path: Path) -> None:
@@ -142,39 +144,42 @@ def test_replay_data_set_inherits_settings_and_writes_differences(tmp_path: Path
     assert "fields" not in config_as_dict(parse_config(values, where=""))["replay"]["data"]
 
 
-def test_config_of_version_0_1_with_replay_and_removed_keys_loads(replaying, caplog) -> None:
-    config = replaying()
+def test_config_of_version_0_1_with_replay_and_removed_keys_loads(make_replay_config, caplog) -> None:
+    config = make_replay_config()
     folder = Path(config.run_dir)
     folder.mkdir()
-    values, gone = (
+    values, removed = (
         config_as_dict(config),
         {"check_crc": "once", "connections": 16, "prefetch": 4, "short_episodes": "skip"},
     )
-    values["data"] |= gone
-    values["replay"]["data"] = config.replay.data.model_dump(mode="json") | gone | {"validation_share": 0.0}
+    values["data"] |= removed
+    values["replay"]["data"] = config.replay.data.model_dump(mode="json") | removed | {"validation_share": 0.0}
     (folder / "config.yaml").write_text(json.dumps(values))
     assert read_run_config(folder) == config
     assert "data.prefetch was 4; this version always uses 2" in caplog.text
 
 
-def test_other_frame_size_in_replay_raises_and_caches_are_accepted(replaying, reporter, tmp_path) -> None:
+def test_other_frame_size_in_replay_raises_and_caches_are_accepted(make_replay_config, reporter, tmp_path) -> None:
     larger = write_synthetic_droid(tmp_path / "larger", episodes=4, steps=20, size=(48, 80), first=100)
     with pytest.raises(InputError, match=r"(?s)replay.data: clips of frames of 48x65.*36x49.*data.cache"):
-        train(replaying(replay__data__path=str(larger)), reporter)
+        train(make_replay_config(replay__data__path=str(larger)), reporter)
     caches = {"data__cache": "auto", "replay__data__cache": "auto"}
-    places = {"data__cache_dir": str(tmp_path / "latents"), "replay__data__cache_dir": str(tmp_path / "latents")}
-    train(replaying(replay__data__path=str(larger), training__steps=1, **caches, **places), reporter)
+    cache_folders = {"data__cache_dir": str(tmp_path / "latents"), "replay__data__cache_dir": str(tmp_path / "latents")}
+    train(make_replay_config(replay__data__path=str(larger), training__steps=1, **caches, **cache_folders), reporter)
     other = {"replay__data__cache_dtype": "int8", "run_dir": str(tmp_path / "other")}
     with pytest.raises(InputError, match=r"(?s)as int8 with scales.*as bfloat16"):
-        train(replaying(replay__data__path=str(larger), training__steps=1, **caches, **places, **other), reporter)
+        train(
+            make_replay_config(replay__data__path=str(larger), training__steps=1, **caches, **cache_folders, **other),
+            reporter,
+        )
 
 
-def test_warning_lists_held_out_episodes_in_the_replay_data(replaying, reporter, data_folder) -> None:
-    set_up(replaying(replay__data__path=str(data_folder)), reporter)
+def test_warning_lists_held_out_episodes_in_the_replay_data(make_replay_config, reporter, data_folder) -> None:
+    set_up(make_replay_config(replay__data__path=str(data_folder)), reporter)
     (warning,) = [note for note in reporter.notes if "the replay data set would train on" in note]
-    held_out = open_dataset(replaying().data).windows("validation")
-    assert open_dataset(replaying().data).table.identity(held_out[0][0]) in warning
+    held_out = open_dataset(make_replay_config().data).windows("validation")
+    assert open_dataset(make_replay_config().data).table.identity(held_out[0][0]) in warning
     reporter.notes.clear()
     same = {"replay__data__validation_share": 0.3, "replay__data__test_share": 0.2}
-    set_up(replaying(replay__data__path=str(data_folder), **same), reporter)
+    set_up(make_replay_config(replay__data__path=str(data_folder), **same), reporter)
     assert not [note for note in reporter.notes if "held-out" in note]

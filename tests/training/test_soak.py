@@ -1,6 +1,6 @@
-"""A run that is killed repeatedly, at any time, equals one that is not.
+"""A run that is killed repeatedly, at any time, equals an uninterrupted run.
 
-A few kills here; many before a release (VJEPA2_AC_SOAK=20: so many kills of each kind of run).
+Three kills by default. Before a release, VJEPA2_AC_SOAK=20 sets the number of kills for each kind of run.
 """
 
 import logging
@@ -18,8 +18,8 @@ from vjepa2_ac.training.loop import train
 
 logger = logging.getLogger(__name__)
 
-MANY = int(os.environ.get("VJEPA2_AC_SOAK", "0"))
-WAYS = ("before a file", "while writing", "whenever")
+SOAK_KILLS = int(os.environ.get("VJEPA2_AC_SOAK", "0"))
+MODES = ("before a file", "while writing", "random time")
 CHANGES = {
     "training__steps": 24, "validation__every": 4, "checkpoint__every": 2, "checkpoint__keep": 2,
 }  # fmt: skip
@@ -30,12 +30,12 @@ class Killer:
 
     def __init__(self, nursery: Nursery, seed: int) -> None:
         self.kills, self.in_a_checkpoint, self.processes = 0, 0, set()
-        self._nursery, self._chance = nursery, np.random.default_rng(seed)
+        self._nursery, self._rng = nursery, np.random.default_rng(seed)
 
     def kill(self, config_file: Path, run: Path) -> int:
         """Start or resume a run and kill it; return its exit status, which is 0 if it finished first."""
         before = half_written(run)
-        child, wait = self._start(WAYS[self.kills % len(WAYS)], config_file, run)
+        child, wait = self._start(MODES[self.kills % len(MODES)], config_file, run)
         self.processes.add(child.pid)
         status = wait()
         if status == KILLED:
@@ -44,15 +44,15 @@ class Killer:
         return status
 
     def _start(self, mode: str, config_file: Path, run: Path):
-        chance, arguments = self._chance, ("train", str(config_file))
-        if mode == "before a file":  # one of some 25 for each checkpoint; those at the start are before the first
-            child = self._nursery.start(*arguments, folder=run, die_at=int(chance.integers(1, 120)))
+        rng, arguments = self._rng, ("train", str(config_file))
+        if mode == "before a file":  # a checkpoint has about 25 file operations
+            child = self._nursery.start(*arguments, folder=run, die_at=int(rng.integers(1, 120)))
             return child, child.wait
         child = self._nursery.start(*arguments, folder=run)
         if mode == "while writing":
-            wait_for_writing(child, run / "checkpoints", times=int(chance.integers(1, 4)))
-            return child, lambda: child.kill_after(chance.uniform(0.0, 0.01))  # about the duration of a write
-        return child, lambda: child.kill_after(chance.uniform(0.0, 2.0))
+            wait_for_writing(child, run / "checkpoints", times=int(rng.integers(1, 4)))
+            return child, lambda: child.kill_after(rng.uniform(0.0, 0.01))  # about the duration of a write
+        return child, lambda: child.kill_after(rng.uniform(0.0, 2.0))
 
 
 def half_written(run: Path) -> set[tuple[str, int]]:
@@ -68,14 +68,14 @@ def wait_for_writing(child: Child, checkpoints: Path, times: int) -> None:
         time.sleep(0.0005)
 
 
-@pytest.mark.parametrize("keep_best", ["off", "error"] if MANY else ["error"])
-@pytest.mark.parametrize("workers", [0, 2] if MANY else [0])
+@pytest.mark.parametrize("keep_best", ["off", "error"] if SOAK_KILLS else ["error"])
+@pytest.mark.parametrize("workers", [0, 2] if SOAK_KILLS else [0])
 def test_run_killed_many_times_equals_an_uninterrupted_run(
     make_config, reporter, tmp_path, nursery: Nursery, workers: int, keep_best: str
 ) -> None:
     changes = {**CHANGES, "checkpoint__keep_best": keep_best}
     train(make_config(run_dir=str(tmp_path / "whole"), **changes), reporter)
-    killer, runs, num_kills = Killer(nursery, seed=2 * workers + (keep_best == "error")), 0, MANY or len(WAYS)
+    killer, runs, num_kills = Killer(nursery, seed=2 * workers + (keep_best == "error")), 0, SOAK_KILLS or len(MODES)
     while killer.kills < num_kills:
         runs += 1
         run, config_file = tmp_path / f"killed-{runs}", tmp_path / f"{runs}.yaml"

@@ -40,18 +40,18 @@ def step_gradients(run: Run, batches: list[Batch]) -> tuple[Gradients, dict[str,
 @pytest.mark.parametrize("read", [[[], [1, 2, 3]]])
 def test_skipped_clips_give_the_mean_over_the_remaining_clips(make_config, reporter, read: list[list[int]]) -> None:
     run = prepared(make_config, reporter, 4, 2)
-    whole = next(training_loader(run.dataset, seed=0, batch_size=4))
-    metrics, gradient = step_gradients(run, [some_clips(whole, chosen) for chosen in read])
+    batch = next(training_loader(run.dataset, seed=0, batch_size=4))
+    metrics, gradient = step_gradients(run, [some_clips(batch, chosen) for chosen in read])
     clips = [clip for chosen in read for clip in chosen]
-    alone = prepared(make_config, reporter, len(clips), 1)
-    expected, expected_gradient = step_gradients(alone, [some_clips(whole, clips)])
+    reference_run = prepared(make_config, reporter, len(clips), 1)
+    expected, expected_gradient = step_gradients(reference_run, [some_clips(batch, clips)])
     assert metrics.clips == len(clips)
     assert metrics.forced_loss == pytest.approx(expected.forced_loss, rel=1e-5)
     assert metrics.rollout_loss == pytest.approx(expected.rollout_loss, rel=1e-5)
     assert metrics.norm == pytest.approx(expected.norm, rel=1e-4)
     assert gradient
-    for name, one in expected_gradient.items():
-        torch.testing.assert_close(gradient[name], one, rtol=1e-4, atol=1e-7)
+    for name, value in expected_gradient.items():
+        torch.testing.assert_close(gradient[name], value, rtol=1e-4, atol=1e-7)
 
 
 def test_step_without_clips_changes_no_weight_and_is_logged(make_config, reporter) -> None:
@@ -68,11 +68,11 @@ def test_step_without_clips_changes_no_weight_and_is_logged(make_config, reporte
 def test_camera_poses_are_passed_only_to_a_model_that_needs_them(make_config, reporter) -> None:
     run = prepared(make_config, reporter, 2, 1)
     batch = next(training_loader(run.dataset, seed=0, batch_size=2))
-    posed = replace(batch, extrinsics=torch.ones(2, 4, 6))
-    assert get_extrinsics(run.world_model, posed) is None
-    wanting = run.world_model.sizes.predictor.model_copy(update={"use_extrinsics": True})
-    run.world_model.sizes = run.world_model.sizes.model_copy(update={"predictor": wanting})
-    assert get_extrinsics(run.world_model, posed) is posed.extrinsics
+    with_poses = replace(batch, extrinsics=torch.ones(2, 4, 6))
+    assert get_extrinsics(run.world_model, with_poses) is None
+    with_extrinsics = run.world_model.sizes.predictor.model_copy(update={"use_extrinsics": True})
+    run.world_model.sizes = run.world_model.sizes.model_copy(update={"predictor": with_extrinsics})
+    assert get_extrinsics(run.world_model, with_poses) is with_poses.extrinsics
     with pytest.raises(InputError, match=r"use_extrinsics: no camera pose in some of these episodes: /data/LAB"):
         get_extrinsics(run.world_model, batch)
 
@@ -90,10 +90,12 @@ def test_loss_scale_of_a_power_of_two_changes_nothing(make_config, reporter) -> 
     for run in (plain, scaled):
         batches = training_loader(run.dataset, seed=0, batch_size=2)
         rows.append([training_step(run, batches, step) for step in (1, 2, 3)])
-    assert [row["grad_norm"] for row in rows[0]] == [row["grad_norm"] for row in rows[1]], "clipped by the true norm"
-    assert rows[1][-1]["loss_scale"] == 2048.0, "it has grown after two good steps"
+    assert [row["grad_norm"] for row in rows[0]] == [row["grad_norm"] for row in rows[1]], (
+        "the norm must be computed from unscaled gradients"
+    )
+    assert rows[1][-1]["loss_scale"] == 2048.0, "the scale doubles after two finite steps"
     weights = zip(plain.world_model.parameters(), scaled.world_model.parameters(), strict=True)
-    assert all(torch.equal(one, other) for one, other in weights)
+    assert all(torch.equal(value, reference) for value, reference in weights)
 
 
 def test_overflow_skips_the_update_and_halves_the_loss_scale(make_config, reporter) -> None:
@@ -116,9 +118,9 @@ def test_overflow_at_the_smallest_loss_scale_raises(make_config, reporter) -> No
         training_step(run, training_loader(run.dataset, seed=0, batch_size=2), 1)
 
 
-def test_the_loss_scale_is_restored(make_config, reporter, tmp_path) -> None:
+def test_loss_scale_is_restored_from_a_checkpoint(make_config, reporter, tmp_path) -> None:
     config = make_config(training__max_grad_norm=None, training__precision="fp16")
-    on_cpu = make_accelerator(make_config())  # which fp16 would be refused on
+    on_cpu = make_accelerator(make_config())  # fp16 on a CPU is an error in `make_accelerator`
     run = with_loss_scale(set_up(config, reporter, accelerator=on_cpu), 64.0)
     training_step(run, training_loader(run.dataset, seed=0, batch_size=2), 1)
     save_checkpoint(run, tmp_path / "run")
@@ -127,7 +129,7 @@ def test_the_loss_scale_is_restored(make_config, reporter, tmp_path) -> None:
     assert other.scaler.state_dict()["_growth_tracker"] == 1
 
 
-# Clips of a step that is not finite are saved for inspection, and saving never hides the error
+# A loss that is not finite
 
 
 @pytest.fixture
@@ -136,13 +138,13 @@ def bad_clip(make_config: Any, reporter: Any, monkeypatch: pytest.MonkeyPatch) -
     read, batch = loader.read_clip, next(iterate_batches(set_up(make_config(), reporter)))
     bad = (batch.episode_ids[1], batch.starts[1])
 
-    def poisoned(*arguments: Any) -> Clip:
+    def read_with_nan(*arguments: Any) -> Clip:
         clip = read(*arguments)
         if (clip.episode_id, clip.start) == bad:
             clip.states[1, 0] = np.nan
         return clip
 
-    monkeypatch.setattr(loader, "read_clip", poisoned)
+    monkeypatch.setattr(loader, "read_clip", read_with_nan)
     return bad
 
 

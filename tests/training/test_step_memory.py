@@ -48,7 +48,7 @@ CASES = {  # adapter, other keys, sizes
 }  # fmt: skip
 
 
-class Counting(TorchDispatchMode):
+class StorageCounter(TorchDispatchMode):
     """Counts the bytes of real tensors that are allocated at the same time."""
 
     def __init__(self) -> None:
@@ -75,8 +75,8 @@ def measured_peaks(config: Config, sizes: ModelSizes) -> tuple[int, ...]:
     """Return the peak bytes of a forward and backward pass, without and with checkpointing."""
     rotary_tables.cache_clear()
     dtype, peaks = PRECISIONS[config.training.precision], []
-    arithmetic = contextlib.nullcontext() if dtype == torch.float32 else torch.autocast("cpu", dtype)
-    with Counting() as counting:
+    precision = contextlib.nullcontext() if dtype == torch.float32 else torch.autocast("cpu", dtype)
+    with StorageCounter() as counter:
         model = built(config, sizes)
         for parameter in model.parameters():
             parameter.grad = torch.zeros_like(parameter) if parameter.requires_grad else None
@@ -84,12 +84,12 @@ def measured_peaks(config: Config, sizes: ModelSizes) -> tuple[int, ...]:
         for checkpointing in (False, True):
             model.set_gradient_checkpointing(checkpointing)
             with matrices.use():
-                counting.storages.forget()
-                with arithmetic:
+                counter.storages.forget()
+                with precision:
                     loss = torch.stack(Objective(model, config.training)(batch)).sum()
                 loss.backward()
             del loss
-            peaks.append(counting.storages.peak)
+            peaks.append(counter.storages.peak)
     return tuple(peaks)
 
 
@@ -111,8 +111,8 @@ def test_memory_of_all_blocks_follows_from_two_and_three(monkeypatch: pytest.Mon
     assert inferred == pytest.approx(whole, rel=0.005)  # the step of the peak may change with depth
 
 
-@pytest.mark.parametrize(("changes", "copies"), [({}, False), (FLOAT32_BASE, True)])
-def test_norms_on_cuda_keep_a_float32_copy_under_autocast(changes: dict[str, Any], copies: bool) -> None:
+@pytest.mark.parametrize(("changes", "has_copies"), [({}, False), (FLOAT32_BASE, True)])
+def test_norms_on_cuda_keep_a_float32_copy_under_autocast(changes: dict[str, Any], has_copies: bool) -> None:
     config, sizes = run_config(LORA, **changes, training__attention="per_step"), model_sizes()
     cpu, cuda = (measure_step(config, sizes, device) for device in ("cpu", "cuda"))
-    assert (cuda.stored > cpu.stored) == copies
+    assert (cuda.stored > cpu.stored) == has_copies

@@ -33,15 +33,15 @@ def test_auto_stride_is_chosen_once_and_stored(
     assert any("Best stride" in note for note in reporter.notes)
 
     monkeypatch.setattr("vjepa2_ac.inspection.variants.calibrate_model", lambda *_: pytest.fail("chosen again"))
-    more = type(reporter)()
-    train(config, more)  # the same config, auto still
-    assert not [note for note in more.notes if "Best stride" in note]
+    second_reporter = type(reporter)()
+    train(config, second_reporter)  # the same config, still with auto
+    assert not [note for note in second_reporter.notes if "Best stride" in note]
 
 
 def test_auto_stride_is_chosen_among_strides_that_fit_the_clips(
     make_config: Make, reporter: Any, candidates: list[int]
 ) -> None:
-    # 24 steps hold 12 frames at stride 2 only, though the 8 frames of a calibration at stride 3, too.
+    # An episode of 24 steps contains a clip of 12 frames at stride 2 only, but a calibration clip (8 frames) also at 3.
     config = make_config(data__stride="auto", data__frames=12, training__steps=1)
     assert read_run_config(train(config, reporter)).data.stride == 2
     assert "  stride 3: not possible: no clip of 12 frames fits" in reporter.notes

@@ -41,7 +41,7 @@ def test_ten_steps_of_the_flat_loop_equal_the_production_loop(simulated: Path, t
     reporter.on_step = lambda _, metrics: expected.append(metrics["loss"])  # type: ignore[method-assign]
     weights = trained_weights(train(config, reporter))
     assert losses == expected
-    found = {name.replace(".default", ""): value for name, value in model.predictor.state_dict().items()}
+    flat_weights = {name.replace(".default", ""): value for name, value in model.predictor.state_dict().items()}
     assert weights
     for name, value in weights.items():
-        assert torch.equal(found[name], value), name
+        assert torch.equal(flat_weights[name], value), name

@@ -1,4 +1,4 @@
-"""Validation: action ranking, selection of the best checkpoint, and early end of a run."""
+"""Validation: action ranking, selection of the best checkpoint, and early stopping."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ def validations(folder: Path) -> list[dict[str, Any]]:
 
 
 @pytest.fixture
-def ranks_are(monkeypatch):
+def set_validation_errors(monkeypatch):
     """Return a function that sets the (rollout error, ranking error) of validations, the base model's first."""
 
     def use(*errors: tuple[float, float]) -> None:
@@ -59,29 +59,31 @@ def test_unreadable_clips_are_replaced_in_the_ranking(make_config, reporter, mon
         (run.dataset.table.identity(episode), start)
         for episode, start in loader.validation_windows(run.dataset, "validation", clips=8)
     ]
-    chosen = [names[place] for place in spread_indices(8, 3)]
+    chosen = [names[index] for index in spread_indices(8, 3)]
     unused = [name for name in names if name not in chosen]
     ranked, broken, read = [], {*chosen[1:], unused[0]}, loader.read_clip
 
-    def some_read(dataset: object, request: loader.ClipRequest) -> object:
+    def read_or_raise(dataset: object, request: loader.ClipRequest) -> object:
         if (run.dataset.table.identity(request.episode), request.start) in broken:
             raise InputError(where="a clip", found="its image is damaged")
         return read(dataset, request)
 
-    def rank(_model: object, moves: list[Transition], *_: object, **__: object) -> None:
+    def record_ranked_clips(_model: object, moves: list[Transition], *_: object, **__: object) -> None:
         ranked.extend((move.episode_id, move.first_step) for move in moves)
 
-    monkeypatch.setattr(loader, "read_clip", some_read)
-    monkeypatch.setattr(validation, "rank_actions", rank)
+    monkeypatch.setattr(loader, "read_clip", read_or_raise)
+    monkeypatch.setattr(validation, "rank_actions", record_ranked_clips)
     validation.validate(run, reporter)
-    assert ranked == [name for name in (chosen[0], unused[1], unused[2]) for _ in range(2)], "two moves of each"
+    assert ranked == [name for name in (chosen[0], unused[1], unused[2]) for _ in range(2)], "two motions per clip"
     broken.update(names)
     with pytest.raises(InputError, match="4 of 8 episodes are broken"):
         validation.validate(run, reporter)
 
 
-def test_lowest_ranking_error_is_selected_while_the_rollout_error_decreases(make_config, reporter, ranks_are) -> None:
-    ranks_are((0.9, 0.10), (0.8, 0.05), (0.7, 0.06), (0.6, 0.07), (0.5, 0.08), (0.4, 0.2), (0.3, 0.3))
+def test_lowest_ranking_error_is_selected_while_the_rollout_error_decreases(
+    make_config, reporter, set_validation_errors
+) -> None:
+    set_validation_errors((0.9, 0.10), (0.8, 0.05), (0.7, 0.06), (0.6, 0.07), (0.5, 0.08), (0.4, 0.2), (0.3, 0.3))
     folder = train(make_config(**EVERY_STEP, checkpoint__keep=1), reporter)
     assert {path.name for path in (folder / "checkpoints").iterdir()} == {checkpoint_name(1), checkpoint_name(6)}
     assert describe_selection(folder) == (
@@ -92,24 +94,24 @@ def test_lowest_ranking_error_is_selected_while_the_rollout_error_decreases(make
 
 def test_resume_after_saving_the_base_is_exact(make_config, reporter, tmp_path, monkeypatch) -> None:
     whole = train(make_config(run_dir=str(tmp_path / "whole")), reporter)
-    halted = make_config(run_dir=str(tmp_path / "halted"))
+    interrupted_config = make_config(run_dir=str(tmp_path / "halted"))
     monkeypatch.setattr(loop, "_optimize", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        train(halted, reporter)
+        train(interrupted_config, reporter)
     monkeypatch.undo()
     assert read_state(newest_checkpoint(tmp_path / "halted/checkpoints")).step == 0
-    assert_same_run(whole, train(halted, reporter))
+    assert_same_run(whole, train(interrupted_config, reporter))
 
 
-def test_run_without_improvement_ends_after_patience(make_config, reporter, ranks_are) -> None:
-    ranks_are((0.9, 0.10), (0.8, 0.05), *[(0.85, 0.06)] * 5)
+def test_run_without_improvement_ends_after_patience(make_config, reporter, set_validation_errors) -> None:
+    set_validation_errors((0.9, 0.10), (0.8, 0.05), *[(0.85, 0.06)] * 5)
     config = make_config(**EVERY_STEP, training__patience=2, checkpoint__keep_best="ranking")
     folder = train(config, reporter)
     assert [row["step"] for row in validations(folder)] == [0, 1, 2, 3]
     assert read_state(newest_checkpoint(folder / "checkpoints")).step == 3
     assert any(note.startswith("Training stops at step 3: no improvement since step 1") for note in reporter.notes)
     train(config, reporter)
-    assert read_state(newest_checkpoint(folder / "checkpoints")).step == 3, "it has ended"
+    assert read_state(newest_checkpoint(folder / "checkpoints")).step == 3, "a run that has ended must not continue"
 
 
 def test_ignored_actions_are_reported_after_warm_up_and_at_the_end(make_config, reporter) -> None:
@@ -118,6 +120,6 @@ def test_ignored_actions_are_reported_after_warm_up_and_at_the_end(make_config, 
         "encoder": {"width": 24, "depth": 1, "heads": 2},
         "predictor": {"width": 24, "depth": 1, "heads": 2},
     }
-    copying = {"model__base": "random", "model__sizes": sizes, "adapter__kind": "none"}
-    train(make_config(**EVERY_STEP, **copying, training__learning_rate=1e-12, training__warmup_steps=2), reporter)
+    copying_model = {"model__base": "random", "model__sizes": sizes, "adapter__kind": "none"}
+    train(make_config(**EVERY_STEP, **copying_model, training__learning_rate=1e-12, training__warmup_steps=2), reporter)
     assert sum("ignores its actions" in note for note in reporter.notes) == 2

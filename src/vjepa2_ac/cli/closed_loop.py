@@ -161,7 +161,7 @@ def _loaded(options: argparse.Namespace, goals: NamedGoals | None) -> tuple[Sess
         image_keys=IMAGE_KEYS if options.image_key is None else (options.image_key,),
         deadline_s=options.deadline,
         dry_run=options.dry_run,
-        is_blind=is_blind(read_run_ranking_error(options.subject, loaded.chosen)),
+        is_blind=is_blind(read_run_ranking_error(options.subject, loaded.checkpoint_label)),
     )
     controller = Controller.of_subject(loaded, extrinsics=options.extrinsics)
     for sequence in (goals or {}).values():
@@ -254,7 +254,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     files = write_benchmark(benchmark, folder, asdict(verdict))
     if options.all:
         subject = benchmark.subject
-        title = f"{subject.name}: checkpoint {subject.chosen}" if subject.chosen else subject.name
+        title = f"{subject.name}: checkpoint {subject.checkpoint_label}" if subject.checkpoint_label else subject.name
         cli.show(title, benchmark_table(benchmark), files=files)
     summary = _summary(benchmark, verdict, options)
     cli.show(*benchmark_notes(benchmark), str(summary), *_next(summary, verdict, options))
@@ -345,11 +345,11 @@ def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse
     )
     measured = f"{trials.task}, {trials.place}, {counted(trials.steps, 'step')} of {trials.seconds_per_step:.2f} s"
     summary = Summary(subject.name, measured, prediction, sensitivity, ranking, verdict)
-    if subject.chosen and (Path(subject.name) / METRICS_FILE).is_file():
+    if subject.checkpoint_label and (Path(subject.name) / METRICS_FILE).is_file():
         with contextlib.suppress(InputError):  # metrics.json has an older format: keep "not measured"
             evaluated = read_metrics(Path(subject.name))
             # Only the names are compared, because older files describe the selection in other words.
-            names = {text.partition(" ")[0] for text in (evaluated.about.checkpoint, subject.chosen)}
+            names = {text.partition(" ")[0] for text in (evaluated.about.checkpoint, subject.checkpoint_label)}
             if len(names) == 1:
                 summary = replace(evaluated.summary, measured=measured, planning=verdict)
     return summary

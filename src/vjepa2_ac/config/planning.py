@@ -139,13 +139,16 @@ class PlanningConfig(Section):
         return self.check_rules(
             (self.horizon % repeat, f"horizon {self.horizon} is not a multiple of action_repeat {repeat}"),
             (few_samples, f"planner {self.planner.name}: {elites} elites are more than {self.samples} samples"),
-            (views and self.axes, f"views excludes axes, which are calibrated with one camera. Leave axes out, {fix}"),
-            (views and self.prior, f"views excludes prior, which is trained with one camera. Leave prior out, {fix}"),
+            (
+                views and self.axes,
+                f"axes are calibrated with one camera, and views is {self.views}. Remove axes, {fix}",
+            ),
+            (views and self.prior, f"prior is trained with one camera, and views is {self.views}. Remove prior, {fix}"),
             (
                 views and self.monitor,
-                f"views excludes monitor, which is made with one camera. Leave monitor out, {fix}",
+                f"monitor is made with one camera, and views is {self.views}. Remove monitor, {fix}",
             ),
-            (self.prior and self.warm_start, "prior excludes warm_start: each is the start of a search. Leave one out"),
+            (self.prior and self.warm_start, "prior and warm_start both set the start of a search. Remove one of them"),
             (
                 self.planner.name == "prior" and not self.prior,
                 "planner=prior needs prior; `vjepa2-ac prior` trains one",

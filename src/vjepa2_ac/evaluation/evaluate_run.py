@@ -231,7 +231,7 @@ def _about(subject: Subject, config: Config, dataset: Dataset, options: Evaluati
     data = dataset.config
     return About(
         subject=subject.name,
-        checkpoint=subject.chosen,
+        checkpoint=subject.checkpoint_label,
         checkpoint_path=str(subject.checkpoint or ""),
         source=data.source,
         data=data.path,

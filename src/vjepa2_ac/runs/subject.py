@@ -34,7 +34,7 @@ class Subject:
     config: Config
     world_model: WorldModel  # on the CPU; `load_for_planning` moves it to its device and merges the adapter
     checkpoint: Path | None = None  # the checkpoint folder; None for a model
-    chosen: str = ""  # description of the checkpoint; "" for a model
+    checkpoint_label: str = ""  # folder name, and how it was selected; "" for a model
     is_base: bool = False  # the checkpoint has the weights of the base model
     note: str = ""  # a sentence about a checkpoint of step 0; "" for a trained checkpoint
     warnings: tuple[str, ...] = ()  # the note, and a warning if plans may exceed the motions in the training data
@@ -47,7 +47,7 @@ class Subject:
             "time": utc_now(),
             "model": {
                 "subject": self.name,
-                "checkpoint": self.chosen or None,
+                "checkpoint": self.checkpoint_label or None,
                 **model.fingerprints()._asdict(),
                 "dtype": str(next(model.parameters()).dtype).removeprefix("torch."),
                 "device": model.device.type,
@@ -116,13 +116,13 @@ def describe_untrained_model(config: Config, checkpoint: Path) -> str:
     return BASE_MODEL
 
 
-def note_on_untrained_model(config: Config, chosen: SelectedCheckpoint) -> str:
+def note_on_untrained_model(config: Config, selected: SelectedCheckpoint) -> str:
     """Return a sentence if a checkpoint is the untrained model, with why it was selected; otherwise ""."""
-    if parse_step(chosen.path.name):
+    if parse_step(selected.path.name):
         return ""
-    untrained, state = describe_untrained_model(config, chosen.path), chosen.newest
-    if chosen.selection not in {SELECTED, BEST}:
-        return f"{'The newest checkpoint' if chosen.selection == NEWEST else 'Checkpoint 0'} is the {untrained}."
+    untrained, state = describe_untrained_model(config, selected.path), selected.newest
+    if selected.selection not in {SELECTED, BEST}:
+        return f"{'The newest checkpoint' if selected.selection == NEWEST else 'Checkpoint 0'} is the {untrained}."
     if state.step < min(config.validation.every, config.training.steps):
         return f"The selected checkpoint is the {untrained}: no later checkpoint has been validated."
     training = "training" if config.model.is_random else "fine-tuning"
@@ -136,15 +136,15 @@ def describe_selection(folder: Path) -> str:
     Raises:
         InputError: See `select_checkpoint`.
     """
-    config, chosen = read_run_config(folder), select_checkpoint(folder)
-    state, step = chosen.newest, parse_step(chosen.path.name) or 0
-    lines = [f"Selected checkpoint: step {step:,}, {chosen.reason}."]
+    config, selected = read_run_config(folder), select_checkpoint(folder)
+    state, step = selected.newest, parse_step(selected.path.name) or 0
+    lines = [f"Selected checkpoint: step {step:,}, {selected.reason}."]
     if state.best_ranking_error is not None:
         base = ""
         if step and state.base_ranking_error is not None:
-            base = f"{describe_untrained_model(config, chosen.path)} {100 * state.base_ranking_error:.1f} %, "
+            base = f"{describe_untrained_model(config, selected.path)} {100 * state.base_ranking_error:.1f} %, "
         lines.append(f"Action-ranking error in validation: {100 * state.best_ranking_error:.1f} % ({base}chance 50 %).")
-    return "\n".join(filter(None, (*lines, note_on_untrained_model(config, chosen))))
+    return "\n".join(filter(None, (*lines, note_on_untrained_model(config, selected))))
 
 
 def read_config_of_moved_run(folder: Path, overrides: Iterable[str]) -> Config:

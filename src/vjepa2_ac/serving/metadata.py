@@ -42,7 +42,7 @@ def make_metadata(loaded: Subject, session: Session) -> dict[str, Any]:
         "limits": planning.limits.model_dump(mode="json"),
         "planning": planning.model_dump(mode="json"),
         "seed": session.controller.seed,
-        "checkpoint": loaded.chosen,
+        "checkpoint": loaded.checkpoint_label,
         "use_extrinsics": loaded.world_model.sizes.predictor.use_extrinsics,
         "image_keys": list(options.image_keys),
         "goals": sorted(session.goals)[:_MAX_NAMES],

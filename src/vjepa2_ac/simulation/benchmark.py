@@ -332,7 +332,7 @@ def write_benchmark(benchmark: ClosedLoopBenchmark, folder: Path, verdict: Mappi
     subject, model, file = benchmark.subject, benchmark.results[0], folder / CLOSED_LOOP_FILE
     about = {
         "subject": subject.name,
-        "checkpoint": subject.chosen,
+        "checkpoint": subject.checkpoint_label,
         **benchmark.trials.about,
         "planning": subject.config.planning.model_dump(mode="json"),
         "warnings": list(subject.warnings),
