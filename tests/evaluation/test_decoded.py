@@ -14,9 +14,9 @@ from torch import Tensor
 from vjepa2_ac.decoding.decoder import Decoder, DecoderCard, DecoderShape, TrainedDecoder, to_pixels
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.decoded import (
+    BASELINES,
     DECODED_PERSISTENCE,
     DECODED_TRUTH,
-    NEIGHBOURS,
     measure_decoded,
 )
 from vjepa2_ac.evaluation.evaluate import EvaluatedModel, RepeatableClips
@@ -96,7 +96,7 @@ def of(found: DecodedRollouts, source: str) -> dict[str, list[float]]:
 def test_perfect_predictor_equals_decoded_truth_and_copying_equals_decoded_persistence(
     oracle: DecodedRollouts,
 ) -> None:
-    assert oracle.sources == (*NEIGHBOURS, "base", "adapter")
+    assert oracle.sources == (*BASELINES, "base", "adapter")
     for source, neighbour in (("adapter", DECODED_TRUTH), ("base", DECODED_PERSISTENCE)):
         mine, other = of(oracle, source), of(oracle, neighbour)
         assert mine.keys() == other.keys() >= {"psnr_db.moving.truth", "ssim.whole.decoded_truth"}

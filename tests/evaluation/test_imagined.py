@@ -205,7 +205,7 @@ def test_vector_states_allow_only_recorded_actions(make_config: MakeConfig) -> N
     dataset = open_dataset(config.data)
     batch = next(imagined.read_batches(dataset, validation_windows(dataset, "test", clips=1), batch_size=1))
     options = ImagineOptions(decoder="", actions=("true",))
-    assert list(imagined._actions_of(options, batch, dataset, limits=None)) == [AS_RECORDED]
+    assert list(imagined._select_actions(options, batch, dataset, limits=None)) == [AS_RECORDED]
     options = ImagineOptions(decoder="", actions=("true", "up"))
     with pytest.raises(InputError, match="--actions up: states that are not poses"):
-        imagined._actions_of(options, batch, dataset, limits=None)
+        imagined._select_actions(options, batch, dataset, limits=None)

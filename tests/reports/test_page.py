@@ -22,7 +22,14 @@ from vjepa2_ac.evaluation.rows import make_rows
 from vjepa2_ac.evaluation.summary import PLANNING, Verdict, summarize
 from vjepa2_ac.reports import write
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
-from vjepa2_ac.reports.write import MAX_CLIPS, MAX_VIDEO_BYTES, MAX_VIDEO_S, bar_positions, make_video, report_page
+from vjepa2_ac.reports.write import (
+    MAX_CLIPS,
+    MAX_VIDEO_BYTES,
+    MAX_VIDEO_S,
+    compute_bar_positions,
+    make_video,
+    render_page,
+)
 
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;]]>{}\u202e\x00\ud800é"
 SOLVED = Verdict(
@@ -87,7 +94,7 @@ def images(html: str) -> list[bytes]:
 def test_first_screen_shows_the_console_summary_and_further_numbers(usual: Usual) -> None:
     for one, changes in ((usual[0], {}), (evaluation(episodes=2, clips=8), {"planning": SOLVED})):
         summary = replace(summarize(one, make_rows(one)), **changes)
-        first = report_page(one, summary).partition("<details")[0]
+        first = render_page(one, summary).partition("<details")[0]
         shown = " ".join(Page(re.sub("<[^>]*>", " ", first.partition("</style>")[2])).shown.split())
         printed = [line for line in str(summary).splitlines() if not line.startswith("  Brackets: ")]
         assert not [word for word in " ".join(printed).split() if word not in shown]
@@ -102,12 +109,12 @@ def test_first_screen_shows_the_console_summary_and_further_numbers(usual: Usual
 def test_bar_positions_have_the_order_of_their_values() -> None:
     for value, baseline in ((0.3, 0.0), (-0.3, 0.0), (0.3, 0.5), (0.7, 0.5)):
         verdict = Verdict(PLANNING, "yes", "", value, value - 0.04, value + 0.05, baseline=baseline)
-        bar = bar_positions(verdict)
+        bar = compute_bar_positions(verdict)
         assert 0 < min(bar.values()) < max(bar.values()) < 100
         assert bar["low"] < bar["point"] < bar["high"]
         assert (bar["baseline"] < bar["low"]) == (baseline < value)
-        assert len(set(bar_positions(replace(verdict, low=None, high=None)).values())) == 2
-    assert not bar_positions(replace(verdict, value=None))
+        assert len(set(compute_bar_positions(replace(verdict, low=None, high=None)).values())) == 2
+    assert not compute_bar_positions(replace(verdict, value=None))
 
 
 def test_the_video_shows_the_clip_with_the_median_error_and_is_short_and_small() -> None:

@@ -30,7 +30,7 @@ from vjepa2_ac.evaluation.result import (
 from vjepa2_ac.evaluation.rows import make_rows
 from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import estimate_mean
-from vjepa2_ac.reports.write import report_page
+from vjepa2_ac.reports.write import render_page
 
 ABOUT = About(
     subject="runs/kitchen",
@@ -113,7 +113,7 @@ def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, mo
 
 def page_of(one: Evaluation) -> str:
     """Return the report with the summary that the console shows."""
-    return report_page(one, summarize(one, make_rows(one)))
+    return render_page(one, summarize(one, make_rows(one)))
 
 
 def decoded_strips(one: Evaluation, size: int = 64) -> Evaluation:

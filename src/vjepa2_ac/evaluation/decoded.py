@@ -1,13 +1,13 @@
-"""PSNR, SSIM and Fréchet distance of the decoded rollouts of several models on the same clips, and of baselines.
+"""Measure decoded rollouts of several models on the same clips, and baselines: PSNR, SSIM and Fréchet distance.
 
 Images are compared with two references: the camera's frames (*truth*), and the decoded true latents (*decoded truth*),
-which exclude the decoder's error. PSNR and SSIM reward blur: an object that is smeared over all its possible positions
-scores better than a sharp object in a wrong position. Both are therefore also computed for the moving region only, and
-should be read together with `spread`.
+which exclude the decoder's error. PSNR and SSIM reward blur: an object that is smeared over all possible positions is
+rated better than a sharp object in a wrong position. Both metrics are therefore also computed for the moving region
+only, and should be read together with `spread`.
 
 All images are decoded by the same decoder in float32, without autocast and in batches of equal shape, so that a perfect
-prediction equals the decoded truth bit for bit. Images are compared at the encoder's size, without rounding to 8 bits.
-The clips are read once, batch by batch; only numbers per clip are stored.
+prediction equals the decoded truth bit for bit. Images are compared at the encoder's input size, without rounding to 8
+bits. The clips are read once, batch by batch, and only the values per clip are stored.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from vjepa2_ac.media.image_similarity import masked_mean, moving_region, psnr, s
 from vjepa2_ac.reporter import SILENT, Reporter
 
 DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE = "decoded_truth", "decoded_persistence", "raw_persistence"
-NEIGHBOURS = (DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE)
+BASELINES = (DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE)
 TRUE_FRAMES = "truth"
-_CACHE = "Nothing is compared with true frames: the latents come from a cache, which holds only small ones."
+_CACHE = "Nothing is compared with true frames: the latents come from a cache, which contains only small frames."
 _LEFT_OUT = "clips are left out of the mean, since their images are identical or nothing moves."
 
 Images = Float[Tensor, "batch horizon 3 size size"]
@@ -54,76 +54,76 @@ def measure_decoded(
     encode: Encode | None = None,
     reporter: Reporter = SILENT,
 ) -> DecodedRollouts:
-    """Decode the rollouts of all models with the true actions, and measure them and the baselines in `NEIGHBOURS`.
+    """Decode the rollouts of all models with the true actions, and measure them and the baselines in `BASELINES`.
 
     Args:
         evaluated_models: The models, in the order of the table.
         clips: The clips, which are read once.
         decoder: Decodes latents to images.
-        examples: Clips whose images are returned, too.
+        examples: Clips whose images are returned in addition.
         encode: The frozen encoder, for the Fréchet distance of images; None: it is not measured.
         reporter: Shows the progress.
     """
     progress = reporter.task("decoded rollouts")
-    example_of = {(example.episode_id, example.start): example for example in examples}
-    shown = [evaluated_model.name for evaluated_model in evaluated_models if evaluated_model.role != "other"]
+    examples_by_clip = {(example.episode_id, example.start): example for example in examples}
+    strip_models = [each.name for each in evaluated_models if each.role != "other"]
     ids: list[str] = []
     values: dict[tuple[str, str], list[Float[np.ndarray, "batch horizon"]]] = {}  # by source and metric
     strips: dict[ClipName, DecodedStrip] = {}
     features: dict[str, list[Float[np.ndarray, "batch dim"]]] = {}  # by source
     for batch, frames_of_row in clips.read(None):
-        images = _decoded(batch, evaluated_models, decoder, frames_of_row if clips.has_frames else None)
+        images = _decode_batch(batch, evaluated_models, decoder, frames_of_row if clips.has_frames else None)
         ids += batch.episode_ids
-        for key, metric in _measured(images).items():
-            values.setdefault(key, []).append(metric.double().cpu().numpy())
+        for key, batch_values in _measure_images(images).items():
+            values.setdefault(key, []).append(batch_values.double().cpu().numpy())
         if encode is not None:
             encoded = {name: encode(decoded) for name, decoded in images.sources.items() if name != RAW_PERSISTENCE}
             for source, latents in {TRUE_FRAMES: batch.latents[:, 1:], **encoded}.items():
                 features.setdefault(source, []).append(latents.mean(dim=(1, 2)).double().cpu().numpy())
         for row, clip in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
-            if clip in example_of:
-                strips[clip] = images.strip(row, example_of[clip], shown)
+            if clip in examples_by_clip:
+                strips[clip] = images.make_strip(row, examples_by_clip[clip], strip_models)
         progress(len(ids), len(clips.names))
-    arrays, by_source = (_joined(gather_shared([parts] if ids else [])) for parts in (values, features))
+    arrays, features_by_source = (_concatenate(gather_shared([each] if ids else [])) for each in (values, features))
     ids, strips = gather_shared(ids), dict(gather_shared(list(strips.items())))
     left_out = {}
     for (source, name), array in arrays.items():
         count = int((~np.isfinite(array[:, -1])).sum())
         if count and not (name.endswith(DECODED_TRUTH) and source == DECODED_TRUTH):  # always identical to itself
             left_out[name] = f"{name}, at the last horizon: {count} {_LEFT_OUT}"
-    card, sources = decoder.card, (*NEIGHBOURS, *(evaluated_model.name for evaluated_model in evaluated_models))
+    card, sources = decoder.card, (*BASELINES, *(evaluated_model.name for evaluated_model in evaluated_models))
     card_keys = ("encoder", "crop", "data", "cameras", "episodes", "frames", "steps", "held_out")
     return DecodedRollouts(
         decoder={"folder": decoder.name, "size": card.shape.size} | {name: asdict(card)[name] for name in card_keys},
         sources=tuple(name for name in sources if name in {source for source, _ in arrays}),
-        curves={key: _means(array, ids) for key, array in arrays.items()},
+        curves={key: _average(array, ids) for key, array in arrays.items()},
         fvd={
-            source: frechet_distance(array, by_source[TRUE_FRAMES])
-            for source, array in by_source.items()
+            source: frechet_distance(array, features_by_source[TRUE_FRAMES])
+            for source, array in features_by_source.items()
             if source != TRUE_FRAMES
         },
-        strips=tuple(strips[name] for name in example_of if name in strips),
+        strips=tuple(strips[name] for name in examples_by_clip if name in strips),
         notes=(*([] if clips.has_frames else [_CACHE]), *left_out.values()),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Images:
-    """The images of a batch, with values from 0 to 1."""
+    """The decoded and true images of a batch of clips, with values from 0 to 1."""
 
     sources: Mapping[str, Images]  # baselines and models, without frame 0
     decoded_first: Float[Tensor, "batch 1 3 size size"]
     true: Float[Tensor, "batch time 3 size size"] | None  # the encoder's input; None for cached latents
 
-    def strip(self, row: int, example: Example, models: Sequence[str]) -> DecodedStrip:
-        """Return the images of the clip in one row, frame 0 included."""
+    def make_strip(self, row: int, example: Example, models: Sequence[str]) -> DecodedStrip:
+        """Return the images of one clip of the batch, frame 0 included."""
         rows = {} if self.true is None else {TRUE_FRAMES: to_pixels(self.true[row])}
         for source in (DECODED_TRUTH, *models):
             rows[source] = to_pixels(torch.cat([self.decoded_first[row], self.sources[source][row]]))
         return DecodedStrip(example.why, example.episode_id, example.start, rows)
 
 
-def _decoded(
+def _decode_batch(
     batch: LatentBatch,
     evaluated_models: Sequence[EvaluatedModel],
     trained: TrainedDecoder,
@@ -145,10 +145,10 @@ def _decoded(
     return _Images({**sources, RAW_PERSISTENCE: true[:, :1].expand_as(true[:, 1:])}, first, true)
 
 
-def _measured(images: _Images) -> dict[tuple[str, str], Float[Tensor, "batch horizon"]]:
-    """Return all metrics of all sources, for each reference.
+def _measure_images(images: _Images) -> dict[tuple[str, str], Float[Tensor, "batch horizon"]]:
+    """Return the values of all metrics; the key is a source, and a metric such as psnr_db.moving.truth.
 
-    PSNR of identical images is infinite. If nothing moves, the values of the moving region are NaN.
+    The PSNR of identical images is infinite. If nothing moves, the values of the moving region are NaN.
     """
     references, moving = {DECODED_TRUTH: images.sources[DECODED_TRUTH]}, None
     if images.true is not None:
@@ -164,12 +164,12 @@ def _measured(images: _Images) -> dict[tuple[str, str], Float[Tensor, "batch hor
     return metrics
 
 
-def _joined(parts: Sequence[Mapping[_Key, Sequence[np.ndarray]]]) -> dict[_Key, np.ndarray]:
+def _concatenate(parts: Sequence[Mapping[_Key, Sequence[np.ndarray]]]) -> dict[_Key, np.ndarray]:
     """Concatenate the arrays of all processes and batches."""
     return {key: np.concatenate([array for part in parts for array in part[key]]) for key in parts[0]}
 
 
-def _means(values: Float[np.ndarray, "clips horizon"], ids: Sequence[str]) -> tuple[Estimate, ...]:
+def _average(values: Float[np.ndarray, "clips horizon"], ids: Sequence[str]) -> tuple[Estimate, ...]:
     """Return the mean at each horizon, over the clips whose value is finite."""
     finite = np.isfinite(values)
     return estimate_ratios(np.where(finite, values, 0.0), finite.astype(np.float64), ids)

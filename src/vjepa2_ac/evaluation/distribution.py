@@ -1,21 +1,21 @@
-"""Distribution of predicted latents over clips, compared with the true latents: spread, MMD and Fréchet distance.
+"""Compare the distributions of predicted and true latents over clips: spread, MMD and Fréchet distance.
 
-A prediction that averages possible futures is closer to each of them but varies less over clips: its error is lower,
-and the decoded frame is blurred. `spread` is the trace of the covariance over clips of the predicted latents, divided
-by that of the true latents at the same horizon. 1: as varied as the true latents; below 1: smoothed. The spread does
-not measure the error: the spread of persistence is about 1, too.
+A prediction that averages possible futures has a lower error, but it varies less over clips, and the decoded frame is
+blurred. `spread` is the trace of the covariance over clips of the predicted latents, divided by that of the true
+latents at the same horizon. 1: as varied as the true latents; below 1: smoothed. The spread does not measure the error:
+persistence also has a spread of about 1.
 
 `mmd` is the squared maximum mean discrepancy of features, times 100, unbiased over episodes. The kernel is JEDi's,
-k(x, y) = (<x, y> / dim)^2, so that it is the squared Frobenius distance of the second moments, divided by dim^2. It
-depends on means and covariances, but not on a common sign of all features. **The estimator is not JEDi's**, which
+k(x, y) = (<x, y> / dim)^2. `mmd` is therefore the squared Frobenius distance of the second moments, divided by dim^2.
+It depends on means and covariances, but not on a common sign of all features. **The estimator is not JEDi's**, which
 counts pairs of a clip with itself and so favours predictions with less spread if there are few clips. Here pairs of
-clips from the same episode are excluded, including a prediction and its own true latents. The expectation is 0 if the
-distributions are equal, and single estimates may be negative.
+clips from the same episode are excluded, including the pair of a prediction and its true latents. The expectation is 0
+if the distributions are equal, and single estimates may be negative.
 
 `fvd` is the Fréchet distance as in FVD, with features of the frozen encoder instead of I3D: the latents of a clip,
-averaged over tokens and frames. It is biased upwards, more so with fewer clips, and is therefore reported with the
+averaged over tokens and frames. It is biased upwards, more so with fewer clips. It is therefore reported with the
 number of clips and with the distance between two halves of the true clips. All three metrics depend on the encoder, the
-clips, the number of frames and the stride: compare values only if these are equal.
+clips, the number of frames and the stride: only values for which all of these are equal can be compared.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ _SCALE = 100.0  # factor of the reported MMD
 class LatentSums:
     """Running sums of latents over clips, for the rollouts of one model or for the true latents.
 
-    For each horizon these are stored: the mean over tokens of each clip [dim], the sum over clips [tokens dim], and the
-    sum of squared norms, in float64. The latents themselves are not stored. Sums and norms are of the difference to an
-    origin (default: the mean of the first batch), which keeps them small and does not change the covariance. Sums that
-    are `joined` must have the same origin.
+    For each horizon, the mean over tokens of each clip [dim], the sum over clips [tokens dim], and the sum of squared
+    norms are stored in float64, but not the latents. An origin (default: the mean of the first batch) is subtracted
+    before sums and norms are computed. This keeps the values small and does not change the covariance. Only sums with
+    the same origin can be joined.
     """
 
     def __init__(self, origin: Float[Tensor, "horizon tokens_dim"] | None = None) -> None:
@@ -51,7 +51,7 @@ class LatentSums:
         self._squares: Float[Tensor, " horizon"] | float = 0.0
 
     def add(self, latents: Float[Tensor, "batch horizon tokens dim"], episode_ids: Sequence[str]) -> None:
-        """Add the latents of a batch of clips, in the order of all clips."""
+        """Add the latents of a batch of clips."""
         latents = latents.float()
         flat = latents.flatten(2)
         if self._origin is None:
@@ -63,7 +63,7 @@ class LatentSums:
         self._squares = self._squares + flat.square().sum(dim=(0, 2), dtype=torch.float64).cpu()
 
     @classmethod
-    def joined(cls, parts: Sequence[LatentSums]) -> LatentSums:
+    def join(cls, parts: Sequence[LatentSums]) -> LatentSums:
         """Return the sums over the clips of all parts, which must have the same origin."""
         joined = cls()
         for part in parts:
@@ -79,7 +79,7 @@ class LatentSums:
         return np.concatenate(self._pooled)
 
     def variances(self) -> Float[np.ndarray, " horizon"]:
-        """Return the trace of the covariance over clips, by horizon; 0 if it is within rounding errors."""
+        """Return the trace of the covariance over clips, by horizon; 0 if the trace is within rounding errors."""
         clips = len(self.episode_ids)
         squares, mean = torch.as_tensor(self._squares / clips), torch.as_tensor(self._total / clips)
         traces = squares - mean.square().sum(dim=1)
@@ -106,8 +106,8 @@ def compare_distributions(predicted: LatentSums, true: LatentSums) -> LatentDist
 def frechet_distance(first: Float[np.ndarray, "clips dim"], second: Float[np.ndarray, "other_clips dim"]) -> float:
     """Return |mean - mean'|^2 + tr C + tr C' - 2 tr (C C')^(1/2) of two sets of features; NaN for a single clip.
 
-    With fewer clips than dimensions the covariances are singular. The last trace is exact in this case, too: with
-    C = A'A and C' = B'B it is the sum of the singular values of A B'.
+    With C = A'A and C' = B'B the last trace is the sum of the singular values of A B'. This is exact even with fewer
+    clips than dimensions, although the covariances are then singular.
 
     Source: Dowson and Landau (1982), The Fréchet distance between multivariate normal distributions; as a metric of
     videos, Unterthiner et al. (2018), FVD.
@@ -115,11 +115,12 @@ def frechet_distance(first: Float[np.ndarray, "clips dim"], second: Float[np.nda
     if min(len(first), len(second)) < 2:
         return math.nan
     means = first.mean(axis=0), second.mean(axis=0)
-    left, right = (
+    first_root, second_root = (
         (values - mean) / math.sqrt(len(values) - 1) for values, mean in zip((first, second), means, strict=True)
     )
-    common = np.linalg.svd(left @ right.T, compute_uv=False).sum()
-    return float(np.square(means[0] - means[1]).sum() + np.square(left).sum() + np.square(right).sum() - 2 * common)
+    common = np.linalg.svd(first_root @ second_root.T, compute_uv=False).sum()
+    traces = np.square(first_root).sum() + np.square(second_root).sum()
+    return float(np.square(means[0] - means[1]).sum() + traces - 2 * common)
 
 
 def frechet_distance_of_halves(true: LatentSums) -> float:
@@ -130,7 +131,7 @@ def frechet_distance_of_halves(true: LatentSums) -> float:
 
 
 def relative_spread(predicted: LatentSums, true: LatentSums) -> tuple[Estimate, ...]:
-    """Return the spread at each horizon: trace of the covariance over clips, predicted divided by true; no intervals.
+    """Return the spread at each horizon, without intervals: the trace of the covariance, predicted divided by true.
 
     The values are NaN for a single clip.
     """
@@ -144,26 +145,27 @@ def mmd(
 ) -> Estimate:
     """Return the squared maximum mean discrepancy of predicted and true features of the same clips, times 100.
 
-    Near 0 the estimate is degenerate, and its interval over episodes is too wide. One episode gives no estimate.
+    If the distributions are equal, the estimator is degenerate and its interval is too wide. The value is NaN for a
+    single episode.
 
-    Source: Gretton et al. (2012), A Kernel Two-Sample Test, lemma 6, with pairs of one episode left out as pairs of one
-    sample are there; the kernel: Luo et al. (2410.05203), JEDi.
+    Source of the estimator: Gretton et al. (2012), A Kernel Two-Sample Test, lemma 6. It excludes pairs of a sample
+    with itself; here all pairs within an episode are excluded. Source of the kernel: Luo et al. (2410.05203), JEDi.
     """
     predicted, true = predicted.astype(np.float64), true.astype(np.float64)
     across = _kernel(predicted, true)
-    pairs = _summed(_kernel(predicted, predicted) + _kernel(true, true) - across - across.T, episode_ids)
-    counts = _summed(np.ones((len(episode_ids), len(episode_ids))), episode_ids)
+    pairs = _sum_by_episode(_kernel(predicted, predicted) + _kernel(true, true) - across - across.T, episode_ids)
+    counts = _sum_by_episode(np.ones((len(episode_ids), len(episode_ids))), episode_ids)
 
-    def of_weights(weights: np.ndarray) -> np.ndarray:
-        return np.asarray(_SCALE * _quadratic(weights, pairs) / _quadratic(weights, counts))[:, None]
+    def compute_mmd(weights: np.ndarray) -> np.ndarray:
+        return np.asarray(_SCALE * _quadratic_form(weights, pairs) / _quadratic_form(weights, counts))[:, None]
 
-    return bootstrap_by_weights(of_weights, len(pairs))[0]
+    return bootstrap_by_weights(compute_mmd, len(pairs))[0]
 
 
-def _summed(
+def _sum_by_episode(
     kernel: Float[np.ndarray, "clips clips"], episode_ids: Sequence[str]
 ) -> Float[np.ndarray, "episodes episodes"]:
-    """Return the sum of the kernel over the clips of each pair of episodes, sorted by name; 0 on the diagonal."""
+    """Return the sum of the kernel over the clips of each pair of different episodes; 0 on the diagonal."""
     names, episode_of = np.unique(np.array(episode_ids), return_inverse=True)
     member = np.eye(len(names))[episode_of]
     sums = member.T @ kernel @ member
@@ -176,7 +178,7 @@ def _kernel(
     return np.asarray((first @ second.T / first.shape[1]) ** 2)
 
 
-def _quadratic(
+def _quadratic_form(
     weights: Float[np.ndarray, "draws episodes"], matrix: Float[np.ndarray, "episodes episodes"]
 ) -> Float[np.ndarray, " draws"]:
     """Return w' M w for each draw."""

@@ -199,9 +199,9 @@ def _collect(
     names = gather_shared(names)
     return _Collected(
         errors={name: gather_shared(parts) for name, parts in errors.items()},
-        predicted={name: LatentSums.joined(gather_shared([sums])) for name, sums in predicted.items()},
-        true=LatentSums.joined(gather_shared([true])),
-        copies=LatentSums.joined(gather_shared([copies])),
+        predicted={name: LatentSums.join(gather_shared([sums])) for name, sums in predicted.items()},
+        true=LatentSums.join(gather_shared([true])),
+        copies=LatentSums.join(gather_shared([copies])),
         actions=np.concatenate(gather_shared(actions)),
         names=names,
         transitions=gather_transitions(transitions, clips.device),

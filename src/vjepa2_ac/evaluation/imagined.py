@@ -1,4 +1,4 @@
-"""Decoded rollouts from a held-out clip, from an image with a state, or of a plan."""
+"""Predict and decode frames: from a held-out clip, from an image with a state, or for a plan."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.subject import Subject
 from vjepa2_ac.spaces import StateSpace
 
-_RATE_HZ = 15.0  # control rate that is assumed for an image without data: DROID's
-_SEARCHED = 64  # number of clips from which the clip with the most motion is selected
-_MOST_PLAN_STEPS = 8
+_RATE_HZ = 15.0  # assumed control rate for an image without data: that of DROID
+_NUM_CANDIDATES = 64  # number of clips from which the clip with the most motion is selected
+_MAX_PLAN_FRAMES = 8  # maximum number of predicted frames of a plan that are decoded
 Image = UInt8[np.ndarray, "height width 3"]
 Frames = UInt8[np.ndarray, "time h w 3"]
 Outcome = Callable[[Float[np.ndarray, "steps 7"]], tuple[Frames, Bool[np.ndarray, "time h w"]]]
@@ -65,22 +65,22 @@ class ImagineOptions:
     """Options of a decoded rollout."""
 
     decoder: str
-    actions: tuple[str, ...] = (TRUE, "none", "up", "left", "close")  # names, `true`, or files
+    actions: tuple[str, ...] = (TRUE, "none", "up", "left", "close")  # `true`, names of actions, or files
     steps: int = 7  # model steps
-    size_m: float = STEP_M  # length of a named action in each step, clipped to the limits
+    size_m: float = STEP_M  # length of a named action in each step, clipped to `planning.limits`
     episode: str | None = None  # None: the held-out clip with the most motion
     start: int | None = None  # first control step; None: 0, or that of the clip with the most motion
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, split
 
 
 def imagine_image(session: Subject, options: ImagineOptions, observation: ImageObservation) -> RolloutComparison:
-    """Predict and decode the frames after an image, for actions by name or from files.
+    """Predict and decode the frames after an image, for named actions or actions from files.
 
-    With `planning.views` above 1 the image contains the views of several cameras, as for a planner.
+    With `planning.views` above 1 the image contains the views of several cameras side by side.
 
     Args:
-        session: The model, and the config with the crop and the limits.
-        options: Decoder, actions (names of directions, or files), number of steps, and their size.
+        session: The model, and the config with crop and limits.
+        options: Decoder, actions, number of steps, and size of named actions.
         observation: The image and the state before the first action.
 
     Raises:
@@ -94,21 +94,19 @@ def imagine_image(session: Subject, options: ImagineOptions, observation: ImageO
     space = get_state_space(config.data, len(observation.state))
     _require_directions(space, where="--state")
     limits = config.planning.limits
-    chosen = {name: _actions_by_name(name, options.steps, options.size_m, limits) for name in options.actions}
-    camera = (
-        None
-        if observation.extrinsics is None
-        else torch.as_tensor(observation.extrinsics, dtype=torch.float32).to(model.device)
-    )
+    actions_by_name = {name: _load_actions(name, options.steps, options.size_m, limits) for name in options.actions}
+    camera = None
+    if observation.extrinsics is not None:
+        camera = torch.as_tensor(observation.extrinsics, dtype=torch.float32).to(model.device)
     views = config.planning.views
     latents = encode_frames(model, observation.image[None], config.data.crop, views=views)
     state = np.asarray(observation.state, dtype=np.float64)
     starts = [Start(view_latents, state, space, camera) for view_latents in latents[0].chunk(views)]
-    cut = crop_frames(split_views(observation.image[None], views), config.data.crop)
-    first = np.concatenate(to_display_frames(cut, model.image_size), axis=1)
+    cropped = crop_frames(split_views(observation.image[None], views), config.data.crop)
+    first = np.concatenate(to_display_frames(cropped, model.image_size), axis=1)
     decoded_first = decode_views(decoder.decoder, latents, views)[0]
 
-    def predicted_frames(actions: Float[np.ndarray, "steps 7"]) -> Frames:
+    def predict_and_decode(actions: Float[np.ndarray, "steps 7"]) -> Frames:
         rollout = torch.cat([compute_rollout(model.rollout, start, actions) for start in starts], dim=1)
         return decode_views(decoder.decoder, rollout, views)
 
@@ -120,7 +118,8 @@ def imagine_image(session: Subject, options: ImagineOptions, observation: ImageO
         first=first,
         decoded_first=decoded_first,
         rollouts=tuple(
-            DecodedRollout("model", name, actions, predicted_frames(actions)) for name, actions in chosen.items()
+            DecodedRollout("model", name, actions, predict_and_decode(actions))
+            for name, actions in actions_by_name.items()
         ),
         notes=(
             f"Times in the video assume {_RATE_HZ:g} control steps per second.",
@@ -131,16 +130,15 @@ def imagine_image(session: Subject, options: ImagineOptions, observation: ImageO
 
 
 def _require_directions(space: StateSpace, *, where: str, fix: str = "") -> None:
-    """Check that named actions are defined: not for vectors, and not for poses in the camera frame."""
+    """Check that named actions are defined, which needs poses in the robot base frame."""
     if not space.is_base_pose:
-        problem, needed = (
-            "states that are not poses in the robot base frame",
-            "poses, because names are directions in that frame",
-        )
+        problem = "states that are not poses in the robot base frame"
+        needed = "poses, because names are directions in that frame"
         raise InputError(where=where, found=problem, needed=needed, fix=fix)
 
 
-def _actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig) -> Float[np.ndarray, "steps 7"]:
+def _load_actions(word: str, steps: int, size_m: float, limits: LimitsConfig) -> Float[np.ndarray, "steps 7"]:
+    """Return the named actions, or the actions in a file."""
     if word.lower().endswith((".npy", ".csv")):
         return read_actions(word, steps=steps)
     return make_named_actions(word, steps, size_m=size_m, limits=limits)
@@ -152,9 +150,9 @@ def imagine_clip(
     """Predict and decode a held-out clip with each model, for the recorded actions and for counterfactual actions.
 
     Args:
-        subject: The folder of a run; or a model, with data in `evaluation`.
+        subject: The folder of a run, or a model with the data in `options.evaluation`.
         options: The options.
-        simulate: Simulates the outcome of other actions; if this fails, a note gives the reason.
+        simulate: Simulates the outcome of counterfactual actions; if the simulation fails, a note gives the reason.
         reporter: Shows the progress.
 
     Raises:
@@ -167,29 +165,29 @@ def imagine_clip(
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     require_frames(config.data, to="show what is true")
-    window = _window(dataset, options)
+    window = _select_window(dataset, options)
     reporter.task(LOADING)
     models = load_models(subject, config, options.evaluation, dataset, decoder)
     models.move_to(accelerator.device)
     decoder.to(accelerator.device)
     (batch,) = read_batches(dataset, [window], batch_size=1)
     size = models.world_model.image_size
-    chosen = _actions_of(options, batch, dataset, limits=config.planning.limits)
-    assert batch.frames is not None  # noqa: S101  # `require_frames` refuses cached latents
+    actions_by_name = _select_actions(options, batch, dataset, limits=config.planning.limits)
+    assert batch.frames is not None  # noqa: S101  # `require_frames` raises for cached latents
     frames = to_display_frames(batch.frames[0].numpy(), size)
     truths: dict[str, tuple[Frames, np.ndarray | None]] = {AS_RECORDED: (frames[1:], None)}
     notes: tuple[str, ...] = ()
     try:
         if simulate is not None and (outcome := simulate(dataset, *window)) is not None:
-            for name in chosen.keys() - truths:
-                truths[name] = _crop_and_resize(*outcome(chosen[name]), config=config, size=size)
+            for name in actions_by_name.keys() - truths:
+                truths[name] = _crop_and_resize(*outcome(actions_by_name[name]), config=config, size=size)
     except UserError as error:
         notes = (f"The true outcome of other actions was not simulated: {error}",)
     rollouts: list[DecodedRollout] = []
     with accelerator.autocast():
         latents = encode_batch(models.world_model, batch, device=accelerator.device)
         start, states = Start.from_batch(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
-        for name, actions in chosen.items():
+        for name, actions in actions_by_name.items():
             for model in models.evaluated_models:
                 with model.prediction_context():
                     rollout = compute_rollout(
@@ -214,31 +212,37 @@ def imagine_clip(
     )
 
 
-def _actions_of(options: ImagineOptions, batch: Batch, dataset: Dataset, limits: LimitsConfig) -> dict[str, np.ndarray]:
+def _select_actions(
+    options: ImagineOptions, batch: Batch, dataset: Dataset, limits: LimitsConfig
+) -> dict[str, np.ndarray]:
+    """Return the actions of each model step by name, as `options.actions` requests."""
     recorded = batch.actions[0].double().numpy()
-    chosen: dict[str, np.ndarray] = {}
+    actions_by_name: dict[str, np.ndarray] = {}
     for word in options.actions:
         if word == TRUE:
-            chosen[AS_RECORDED] = recorded
+            actions_by_name[AS_RECORDED] = recorded
             continue
         _require_directions(dataset.spaces.state, where=f"--actions {word}", fix="Use --actions true")
-        name = word if word in ACTION_NAMES else Path(word).name  # with its suffix, so that it equals no action name
-        chosen[word if name in chosen else name] = _actions_by_name(word, len(recorded), options.size_m, limits)
-    return chosen
+        name = (
+            word if word in ACTION_NAMES else Path(word).name
+        )  # with the suffix, so that it differs from action names
+        actions = _load_actions(word, len(recorded), options.size_m, limits)
+        actions_by_name[word if name in actions_by_name else name] = actions
+    return actions_by_name
 
 
-def _window(dataset: Dataset, options: ImagineOptions) -> tuple[int, int]:
+def _select_window(dataset: Dataset, options: ImagineOptions) -> tuple[int, int]:
     """Return the episode and the first control step of the clip to show."""
     lengths, clip, split = dataset.table.num_steps, dataset.config.clip_steps, options.evaluation.split
     if options.episode is None:
-        members = dataset.split_mask(split)[dataset.episodes]
-        longest = int(lengths[dataset.episodes[members]].max(initial=0))
+        is_in_split = dataset.split_mask(split)[dataset.episodes]
+        longest = int(lengths[dataset.episodes[is_in_split]].max(initial=0))
         if 0 < longest < clip:
-            most = (longest - 1) // dataset.config.model_stride
-            problem = f"{counted(options.steps, 'model step')}, and the longest {split} episode has {most}"
-            raise InputError(where="--steps", found=problem, needed=f"at most {most}")
-        windows = validation_windows(dataset, split, clips=_SEARCHED)
-        return max(windows, key=lambda window: _motion(dataset, *window))
+            max_steps = (longest - 1) // dataset.config.model_stride
+            problem = f"{counted(options.steps, 'model step')}, and the longest {split} episode has {max_steps}"
+            raise InputError(where="--steps", found=problem, needed=f"at most {max_steps}")
+        windows = validation_windows(dataset, split, clips=_NUM_CANDIDATES)
+        return max(windows, key=lambda window: _measure_path(dataset, *window))
     episode = find_episode(dataset, options.episode)
     start, last = options.start or 0, int(lengths[episode]) - clip
     if not 0 <= start <= last:
@@ -248,8 +252,8 @@ def _window(dataset: Dataset, options: ImagineOptions) -> tuple[int, int]:
     return episode, start
 
 
-def _motion(dataset: Dataset, episode: int, start: int) -> float:
-    """Return the length of the robot's path in a clip, added up over its model steps."""
+def _measure_path(dataset: Dataset, episode: int, start: int) -> float:
+    """Return the length of the robot's path in a clip, summed over the model steps."""
     steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
     states = dataset.source.read(episode, None, dataset.needed_steps(episode)).states[list(steps)]
     return dataset.spaces.state.compute_path_length(states)
@@ -258,20 +262,18 @@ def _motion(dataset: Dataset, episode: int, start: int) -> float:
 def _crop_and_resize(
     frames: Frames, arm: Bool[np.ndarray, "time h w"], *, config: Config, size: int
 ) -> tuple[Frames, Bool[np.ndarray, "time size size"]]:
-    """Return the frames after the first one, and the arm's silhouettes in all frames, cropped and resized as inputs."""
+    """Crop and resize frames and masks of the arm like the model's input; return the frames after the first one."""
     silhouettes = np.repeat(np.uint8(255) * arm[..., None], 3, axis=-1)
-    inputs, outlines = (
-        to_display_frames(crop_frames(images, config.data.crop), size) for images in (frames, silhouettes)
-    )
-    return inputs[1:], outlines[..., 0] > 127
+    inputs, masks = (to_display_frames(crop_frames(images, config.data.crop), size) for images in (frames, silhouettes))
+    return inputs[1:], masks[..., 0] > 127
 
 
-# ---- of a plan ----
+# ---- the predicted frames of a plan ----
 
 
 @dataclass(frozen=True, eq=False)
 class ImaginedPlan:
-    """Images of a plan, all with the crop and size of the encoder's input."""
+    """The images that a plan predicts, all with the crop and size of the encoder's input."""
 
     start: Image  # decoded current frame
     steps: dict[int, Image]  # number of model steps -> predicted frame, decoded; empty without a plan
@@ -279,34 +281,31 @@ class ImaginedPlan:
     decoded_goal: Image
 
 
-def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
-    """Decode the start, the goal and the predicted frames of a plan; at most eight frames, equally spaced.
+def imagine_plan(result: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
+    """Decode the start, the goal and at most eight equally spaced predicted frames of a plan.
 
     Args:
-        answer: The decision.
+        result: The result of the planner.
         decoder: A decoder for the model's encoder; it is moved to the model's device.
     """
-    controller, goal = answer.controller, answer.request.goals[answer.decision.goals[-1]].image
+    controller, goal = result.controller, result.request.goals[result.decision.goals[-1]].image
     decoder.to(controller.device)
-    latents = torch.stack([controller.encode(image) for image in (answer.request.start, goal)])
+    latents = torch.stack([controller.encode(image) for image in (result.request.start, goal)])
     start, decoded_goal = decode_views(decoder.decoder, latents, controller.config.views)
-    frames = _rollout(answer.decision, decoder)
-    shown_steps = spread_indices_with_ends(len(frames), _MOST_PLAN_STEPS)
+    frames = _decode_plan(result.decision, decoder)
+    shown_steps = spread_indices_with_ends(len(frames), _MAX_PLAN_FRAMES)
     views = crop_frames(split_views(goal[None], controller.config.views), controller.crop)
     goal_input = np.concatenate(to_display_frames(views, decoder.card.shape.image_size), axis=1)
     return ImaginedPlan(start, {step + 1: frames[step] for step in shown_steps}, goal_input, decoded_goal)
 
 
 @torch.no_grad()
-def _rollout(decision: Decision, decoder: TrainedDecoder) -> Frames:
+def _decode_plan(decision: Decision, decoder: TrainedDecoder) -> Frames:
     """Return the decoded frames after each step of a plan; empty without a plan or finite predictions."""
     side = decoder.card.shape.image_size
     no_frames = np.zeros((0, side, side, 3), np.uint8)
     if decision.plan is None or decision.cost is None:
         return no_frames
     latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.rollout(decision.plan.actions[None])[0][0]
-    return (
-        decode_views(decoder.decoder, latents, decision.cost.views)
-        if bool(torch.isfinite(latents).all())
-        else no_frames
-    )
+    is_finite = bool(torch.isfinite(latents).all())
+    return decode_views(decoder.decoder, latents, decision.cost.views) if is_finite else no_frames

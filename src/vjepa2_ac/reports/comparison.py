@@ -1,6 +1,6 @@
-"""Comparison of runs that were measured on the same clips: reads their metrics.json files and joins the rows by key.
+"""Compare runs that were measured on the same clips: read the metrics.json of each run, and join the rows by key.
 
-Nothing is measured here: `vjepa2-ac evaluate` must have written the results before.
+Nothing is measured here. `vjepa2-ac evaluate` writes metrics.json.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from vjepa2_ac.intervals import Estimate, bootstrap
 from vjepa2_ac.reports.metrics_json import Metrics, read_metrics
 from vjepa2_ac.runs.checkpoint import RANKING_TOLERANCE, parse_step, selection_reason
 
-_LINE = "  {:<22}  {:>10}  {:>17}  {:>21}  {:>18}"  # widths of the columns, whose headers have three lines
+_LINE = "  {:<22}  {:>10}  {:>17}  {:>21}  {:>18}"  # a line of the table; the column headers have three lines
 _HEAD = ("", "", "error vs", "one-step error", "action-ranking")
 _COLUMNS = "with shuffled actions", "error, chance 50 %"
 _BETTER = ("", "", "(lower is better)", "(higher is better)", "(lower is better)")
-_SAME = ("split", "frames", "stride", "cameras")
-_SAME_LATENTS = 1e-3  # if persistence's errors differ by more than this share, the latents are different
+_REQUIRED_EQUAL = ("split", "frames", "stride", "cameras")
+_SAME_LATENTS = 1e-3  # larger relative differences between the errors of persistence mean that the latents differ
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs side by side: rows and curves, with one model for each run."""
+    """The results of several runs on the same clips: rows and curves of the evaluated model of each run."""
 
     title: str
     rows: tuple[Row, ...]  # `Row.model` is the name of the run
@@ -44,32 +44,32 @@ class Comparison:
     folders: Mapping[str, Path]
 
     def __str__(self) -> str:
-        """Return a table with the checkpoint and the metrics of each run, and a sentence on the errors' difference."""
+        """Return a table with checkpoint and metrics of each run, and a sentence about the difference of the errors."""
         first, key = next(iter(self.measured.values())), f"rollout.{L1.name}.gain_over_base.{len(self.seconds)}"
         has_base = _have_same_base(self.measured.values())
         reference = "base model" if has_base else "persistence"
         lines = [_LINE.format(*head).rstrip() for head in (_HEAD, ("run", "checkpoint", reference, *_COLUMNS), _BETTER)]
         for name, metrics in self.measured.items():
-            gain, step = metrics.of(key), _step(metrics)
+            gain, step = metrics.of(key), _get_step(metrics)
             error = self.curves[name][-1].value - 1 if not has_base else -gain.value if gain else 0.0
             checkpoint = "base model" if metrics.about.is_base else "none" if step is None else f"{step:,}"
-            used, rank = _number(metrics.summary.sensitivity), _number(metrics.summary.ranking)
-            numbers = (_shown(error, "+.1f"), _shown(used, "+.1f"), _shown(rank, ".1f"))
+            sensitivity, ranking = _get_value(metrics.summary.sensitivity), _get_value(metrics.summary.ranking)
+            numbers = _format(error, "+.1f"), _format(sensitivity, "+.1f"), _format(ranking, ".1f")
             lines.append(_LINE.format(name if len(name) <= 22 else f"…{name[-21:]}", checkpoint, *numbers))
         title = f"{len(self.measured)} runs on the same {first.summary.measured}, {self.seconds[-1]:.1f} s ahead"
         return "\n".join([title, *lines, *textwrap.wrap(self._difference, 100)])
 
     @property
     def _difference(self) -> str:
-        """A sentence that compares the lowest error of the other runs with the first run's error."""
+        """The sentence that compares the lowest error of the other runs with the error of the first run."""
         gains = {row.model: row.estimate for row in self.rows if row.key == "gain_over_first"}
         (first, measured), best = next(iter(self.measured.items())), max(gains, key=lambda name: gains[name].value)
         if not gains[best].has_interval:
             return f"Whether the errors differ is not measured: {self._too_few}"
-        if not (side := gains[best].compare_to(0.0)):
+        if not (sign := gains[best].compare_to(0.0)):
             return f"The errors of {best} and {first} do not differ significantly."
         low, value, high = (format_percent(end) for end in sorted(map(abs, astuple(gains[best]))))
-        change = f"{value} % {'lower' if side > 0 else 'higher'}"
+        change = f"{value} % {'lower' if sign > 0 else 'higher'}"
         interval = f"95 % CI {low} to {high} %, n = {counted(measured.clips.episodes, 'episode')}"
         return f"The error of {best} is {change} than that of {first} ({interval})."
 
@@ -77,41 +77,42 @@ class Comparison:
     def next_command(self) -> str:
         """The command that exports the best run, or the reason why no run is recommended.
 
-        The rule is that of `checkpoint.keep_best`: the lowest action-ranking error; among runs within
-        `RANKING_TOLERANCE` of it, the lowest prediction error.
+        The rule is that of `checkpoint.keep_best`: among the runs within `RANKING_TOLERANCE` of the lowest
+        action-ranking error, the run with the lowest prediction error is the best.
         """
-        ranks = {name: _number(metrics.summary.ranking) for name, metrics in self.measured.items()}
-        equal = [name for name, rank in ranks.items() if rank <= min(ranks.values()) + RANKING_TOLERANCE]
-        best = min(equal, key=lambda name: self.curves[name][-1].value, default="")
+        ranking_errors = {name: _get_value(metrics.summary.ranking) for name, metrics in self.measured.items()}
+        highest = min(ranking_errors.values()) + RANKING_TOLERANCE
+        candidates = [name for name, error in ranking_errors.items() if error <= highest]
+        best = min(candidates, key=lambda name: self.curves[name][-1].value, default="")
         if len({metrics.ranked for metrics in self.measured.values()}) > 1:
             return "No run is recommended: the actions were ranked with different settings."
-        if missing := [name for name, rank in ranks.items() if math.isnan(rank)]:
+        if missing := [name for name, error in ranking_errors.items() if math.isnan(error)]:
             why = f"the action-ranking error of {', '.join(missing)} was not measured."
         elif not (why := self._too_few):
-            why = self._objection(best)
+            why = self._find_objection(best)
         if why:
             return f"No run is recommended: {why}"
-        folder, step = self.folders[best], _step(self.measured[best])
+        folder, step = self.folders[best], _get_step(self.measured[best])
         return f"Next: {shell_command('export', folder, f'{folder.resolve().name}-merged', '--checkpoint', step)}"
 
     @property
     def _too_few(self) -> str:
-        """A sentence that there are too few episodes for a conclusion; empty if there are enough episodes."""
+        """The sentence that there are too few episodes for a conclusion; empty if there are enough."""
         return next(iter(self.measured.values())).summary.prediction.needs.partition(" So far: ")[0]
 
-    def _objection(self, best: str) -> str:
-        """Return why the run with the lowest action-ranking error is not recommended, as a sentence; empty if it is."""
+    def _find_objection(self, best: str) -> str:
+        """Return the sentence why the best run is not recommended; empty if it is recommended."""
         verdict = self.measured[best].summary.ranking
-        if not _step(self.measured[best]):
+        if not _get_step(self.measured[best]):
             return f"{best}, with the lowest action-ranking error, was not fine-tuned."
         if verdict.conclusion == "yes":
             return ""
-        known = "not better" if verdict.conclusion == "no" else "not known to be better"
-        return f"the action ranking of {best} is {known} than {verdict.compared_with}."
+        result = "not better" if verdict.conclusion == "no" else "not known to be better"
+        return f"the action ranking of {best} is {result} than {verdict.compared_with}."
 
 
 def compare(folders: Sequence[Path]) -> Comparison:
-    """Compare the evaluations of several runs; the gain over the first run is paired by clip.
+    """Compare the evaluations of several runs. The gain over the first run is paired by clip.
 
     Args:
         folders: The folders of the runs.
@@ -126,11 +127,11 @@ def compare(folders: Sequence[Path]) -> Comparison:
     counts = Counter(path.name for path in paths)
     names = [path.name if counts[path.name] == 1 else str(path) for path in paths]
     if len(set(paths)) < len(paths):
-        raise InputError(where=", ".join(map(str, folders)), found="the same run twice", needed="different runs")
+        raise InputError(where=", ".join(map(str, folders)), found="one run twice", needed="different runs")
     measured = {name: read_metrics(folder) for name, folder in zip(names, folders, strict=True)}
     first = measured[names[0]]
     for name, folder in zip(names[1:], folders[1:], strict=True):
-        _check_same_clips(first, measured[name], folders[0], folder)
+        _require_same_clips(first, measured[name], folders[0], folder)
     about, clips = first.about, first.clips
     rows = [
         replace(row, model=name, detail=row.detail and not row.key.startswith(f"rollout.{L1.name}.gain_over_base"))
@@ -141,28 +142,28 @@ def compare(folders: Sequence[Path]) -> Comparison:
     return Comparison(
         title=f"{L1.label} error over persistence on {counted(clips.count, about.split + ' clip')}"
         f" of {counted(clips.episodes, 'episode')}",
-        rows=(*_gains(measured), *rows),
+        rows=(*_compute_gains(measured), *rows),
         seconds=about.seconds_per_step * np.arange(1, about.frames),
-        curves={name: _curve(metrics) for name, metrics in measured.items()},
-        notes=_notes(measured),
+        curves={name: _get_curve(metrics) for name, metrics in measured.items()},
+        notes=_make_notes(measured),
         measured=measured,
         folders=dict(zip(names, folders, strict=True)),
     )
 
 
-def _check_same_clips(first: Metrics, second: Metrics, first_folder: Path, second_folder: Path) -> None:
-    pairs = {key: (getattr(first.about, key), getattr(second.about, key)) for key in _SAME}
+def _require_same_clips(first: Metrics, second: Metrics, first_folder: Path, second_folder: Path) -> None:
+    pairs = {key: (getattr(first.about, key), getattr(second.about, key)) for key in _REQUIRED_EQUAL}
     pairs["clips"] = first.clips.count, second.clips.count
     differences = [f"{name}: {a} and {b}" for name, (a, b) in pairs.items() if a != b]
     if not differences and first.clips.fingerprint != second.clips.fingerprint:
         differences = [f"different episodes or start steps, from {first.about.data} and {second.about.data}"]
     if differences:
-        fix = "Evaluate them again with the same --data, --split and --clips"
+        fix = "Evaluate these runs again with the same --data, --split and --clips"
         problem = f"measured on different clips ({'; '.join(differences)})"
         raise InputError(where=f"{first_folder} and {second_folder}", found=problem, fix=fix)
 
 
-def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
+def _compute_gains(measured: Mapping[str, Metrics]) -> list[Row]:
     """Return the relative gain of each run over the first run at the last horizon, paired by clip.
 
     The errors are first divided by those of persistence.
@@ -171,43 +172,41 @@ def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
     ids = [episode for episode, _ in first.clips.named]
     rows = []
     for run, metrics in later_runs:
-        columns = np.stack([*_last(metrics), *_last(first)])[:, :, None]
+        columns = np.stack([*_get_last_errors(metrics), *_get_last_errors(first)])[:, :, None]
         (gain,) = bootstrap(lambda sums: 1 - (sums[0] / sums[1]) / (sums[2] / sums[3]), columns, ids)
-        group, line = (
-            f"Improvement over {name} in L1, open loop",
-            f"{(first.about.frames - 1) * first.about.seconds_per_step:.2f} s ahead",
-        )
+        group = f"Improvement over {name} in L1, open loop"
+        line = f"{(first.about.frames - 1) * first.about.seconds_per_step:.2f} s ahead"
         numbers = (gain.value, gain.low, gain.high)
         rows.append(Row(group, line, "gain_over_first", run, *numbers, form=".1%", better="higher", chance=0.0))
     return rows
 
 
-def _last(metrics: Metrics) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors of each clip at the last horizon: of the evaluated model, and of persistence."""
+def _get_last_errors(metrics: Metrics) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of the evaluated model and of persistence at the last horizon, by clip."""
     errors, persistence = metrics.by_clip.models[metrics.trained], metrics.by_clip.persistence
     return np.array(errors)[:, -1], np.array(persistence)[:, -1]
 
 
-def _number(verdict: Verdict) -> float:
+def _get_value(verdict: Verdict) -> float:
     return math.nan if verdict.value is None else verdict.value
 
 
-def _shown(share: float, form: str) -> str:
-    return "not measured" if math.isnan(share) else f"{round(100 * share, 1) + 0.0:{form}} %"
+def _format(fraction: float, form: str) -> str:
+    return "not measured" if math.isnan(fraction) else f"{round(100 * fraction, 1) + 0.0:{form}} %"
 
 
-def _step(metrics: Metrics) -> int | None:
-    """Return the number of optimizer steps of the measured checkpoint; None for a model without checkpoints."""
+def _get_step(metrics: Metrics) -> int | None:
+    """Return the number of optimizer steps of the evaluated checkpoint; None for a model without checkpoints."""
     return parse_step(Path(metrics.about.checkpoint_path).name)
 
 
-def _curve(metrics: Metrics) -> tuple[Estimate, ...]:
+def _get_curve(metrics: Metrics) -> tuple[Estimate, ...]:
     rows = (metrics.of(f"rollout.{L1.name}.over_persistence.{h}") for h in range(1, metrics.about.frames))
     return tuple(Estimate(math.nan, math.nan, math.nan) if row is None else row.estimate for row in rows)
 
 
 def _have_same_base(measured: Iterable[Metrics]) -> bool:
-    """Return whether all runs were compared with the same base model, recognised by equal errors."""
+    """Return whether all runs were compared with the same base model, which is recognised by equal errors."""
     errors = []
     for metrics in measured:
         if metrics.base is None and not metrics.about.is_base:
@@ -216,10 +215,10 @@ def _have_same_base(measured: Iterable[Metrics]) -> bool:
     return max(errors) - min(errors) <= _SAME_LATENTS * abs(errors[0])
 
 
-def _notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
-    persistence = {name: _last(metrics)[1].mean() for name, metrics in measured.items()}
-    first, *names = measured
-    different = [name for name in names if abs(persistence[name] / persistence[first] - 1) > _SAME_LATENTS]
+def _make_notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
+    persistence = {name: _get_last_errors(metrics)[1].mean() for name, metrics in measured.items()}
+    first, *others = measured
+    different = [name for name in others if abs(persistence[name] / persistence[first] - 1) > _SAME_LATENTS]
     notes = []
     if different:
         notes.append(

@@ -1,4 +1,4 @@
-"""Plots for planning: a decision, and the goals of a demonstration."""
+"""Plot a decision of the planner, and the goals of a demonstration."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
 
 _INPUT_COLOUR = "#e8b10c"
 _WIDTH, _ROW, _PREDICTED_ROW = 9.2, 2.6, 1.8  # inches
-_MAX_CURVES = 8  # largest number of curves for a vector
-_IMAGES_PER_ROW = 4  # goal images per row
-_MAX_GOALS = 3  # largest number of goals in the plot of a plan: the first ones, and the last
+_MAX_CURVES = 8  # maximum number of curves for a vector
+_IMAGES_PER_ROW = 4
+_MAX_GOALS = 3  # maximum number of goals in the plot of a plan: the first goals, and the last goal
 _STAR: dict[str, Any] = {"marker": "*", "s": 150, "color": RED, "edgecolors": "white", "zorder": 5}
 
 
@@ -85,7 +85,7 @@ def _draw_images(part: Any, result: PlanResult) -> None:
 
 
 def _draw_predicted_frames(part: Any, result: PlanResult, imagined: ImaginedPlan) -> None:
-    """Draw the start, the predicted frames and the goal from left to right, framed in the colours of image strips."""
+    """Draw the start, the predicted frames and the goal from left to right, with the border colours of image strips."""
     panels: list[tuple[str, FrameKind, np.ndarray]] = [("start, decoded", "decoded", imagined.start)]
     for step, image in imagined.steps.items():
         is_last = step == result.space.steps
@@ -103,7 +103,7 @@ def _draw_search(part: Any, result: PlanResult, plan: Plan) -> None:
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
     factor = result.state_space.display_factor
     first, upper = result.actions[0] * factor, result.space.upper[0].double().numpy() * factor
-    shown = result.controller.display_components  # with fewer than three components, one of them is shown twice
+    shown = result.controller.display_components  # with fewer than three components, one component is shown twice
     across, up, third = shown[0], shown[min(1, len(shown) - 1)], shown[-1]
     for number, (iteration, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
         first_actions = iteration.elites[:, 0].double().numpy() * factor
@@ -192,7 +192,7 @@ def _draw_slices(part: Any, result: PlanResult) -> None:
 
 
 def plot_goals(demonstration: DemonstrationGoals, path: Path) -> Path:
-    """Write the contact sheet of goals as a PNG file, atomically."""
+    """Write the images of all goals and the gripper's closedness as a PNG file, atomically."""
     images = [demonstration.first, *(goal.image for goal in demonstration.goals)]
     rows = -(-len(images) // _IMAGES_PER_ROW)
     states = demonstration.states

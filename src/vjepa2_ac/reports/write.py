@@ -1,4 +1,4 @@
-"""Writing of the files of an evaluation: metrics.json, metrics.csv, evaluation.png, and one HTML page.
+"""Write the files of an evaluation: metrics.json, metrics.csv, evaluation.png, and one HTML page.
 
 The page begins with the summary and a video. All numbers and plots follow in collapsed sections. The page needs no
 network access and no JavaScript.
@@ -33,16 +33,16 @@ from vjepa2_ac.reports.metrics_json import METRICS_FILE, missing_parts, write_cs
 from vjepa2_ac.storage import write_atomically
 
 PLOT, REPORT = "evaluation.png", "report.html"
-MAX_CLIPS = 4  # largest number of example clips, and of decoded clips
-_BYTES = 3_000_000  # largest size of all clips together
+MAX_CLIPS = 4  # maximum number of example clips, and of decoded clips
+_MAX_CLIP_BYTES = 3_000_000  # maximum size of all clips together
 _BAR_MARGIN = 10.0  # margin on both sides of a bar, in percent of its width
-MAX_VIDEO_S = 6.0  # longest duration of the video, in seconds
-MAX_VIDEO_BYTES = 600_000  # largest size of the video
+MAX_VIDEO_S = 6.0  # maximum duration of the video, in seconds
+MAX_VIDEO_BYTES = 600_000
 _STEP_S, _FIRST_S, _LAST_S = 0.5, 1.2, 1.8  # display times of the middle, first and last frames
 _QUALITIES = (85, 70, 50, 30, 10)
-_THIN = 32  # width of an image divided by the width of a gap or the height of the progress bar
-_GREY, _PASSED = 170, (31, 111, 180)  # colours of gaps and progress bar, visible on white and on black
-_PARTS = {  # title, and a pattern for the keys of the rows
+_GAP_RATIO = 32  # width of an image, divided by the width of a gap or the height of the progress bar
+_GREY, _PROGRESS = 170, (31, 111, 180)  # colours of gaps and progress bar, visible on white and on black
+_PARTS = {  # id of the part -> title, and a pattern for the keys of the part's rows
     "errors": ("Error by horizon", r"rollout\.\w+\.over_persistence"),
     "base": ("Comparison with the base model", r"rollout\."),
     "actions": ("Sensitivity to actions", "one_step|cost_of|gap_of|ranking"),
@@ -73,11 +73,11 @@ class PagePart(NamedTuple):
     notes: Sequence[str]
 
 
-def report_page(evaluation: Evaluation, summary: Summary) -> str:
+def render_page(evaluation: Evaluation, summary: Summary) -> str:
     """Return an evaluation and its summary as one HTML page that needs no network, no script and no other file.
 
-    The same evaluation and summary give the same bytes. The page stays below 5 MB: numbers of clips, points of curves
-    and episodes are limited, and images of clips have the best quality that fits.
+    The same evaluation and summary give the same bytes. The page stays below 5 MB, because the numbers of clips, points
+    of curves and episodes are limited, and images of clips have the best quality that fits.
     """
     rows = make_rows(evaluation)
     environment = Environment(
@@ -95,11 +95,11 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
     )
     environment.filters |= {
         "quote": shlex.quote,
-        "bar": bar_positions,
+        "bar": compute_bar_positions,
         "percent": format_percent,
         "interval": format_interval,
     }
-    environment.filters |= {"code": code_markup, "count": counted}
+    environment.filters |= {"code": render_code, "count": counted}
     environment.filters["number"] = lambda row: f"{format_percent(row.value)} %" if row.better else f"{row.value:.2f}"
     environment.filters["baseline"] = lambda verdict: (
         f"{100 * verdict.baseline:.0f} %" if verdict.unit == "%" else f"{verdict.baseline:.1f} {verdict.unit}"
@@ -107,53 +107,53 @@ def report_page(evaluation: Evaluation, summary: Summary) -> str:
     return environment.get_template("report.html.jinja").render(
         evaluation=evaluation,
         verdicts=summary,
-        tiles=_tiles(evaluation, rows, summary),
+        tiles=_select_tiles(evaluation, rows, summary),
         video=make_video(evaluation),
-        parts=_parts(evaluation, rows),
+        parts=_make_parts(evaluation, rows),
         missing=missing_parts(evaluation),
         short=shorten_names(evaluation.clips.episode_ids),
         style=Markup(resources.files("vjepa2_ac").joinpath("assets/report.css").read_text("utf-8")),  # noqa: S704
     )
 
 
-def code_markup(text: str) -> Markup:
-    """Return a text as HTML; text between backticks becomes code."""
+def render_code(text: str) -> Markup:
+    """Return a text as HTML, with text between backticks as code."""
     parts = [escape(replace_hidden_characters(part)) for part in text.split("`")]
     if len(parts) % 2 == 0:  # an unpaired backtick
         return Markup("`").join(parts)
     return Markup("").join(Markup("<code>{}</code>").format(part) if n % 2 else part for n, part in enumerate(parts))
 
 
-def bar_positions(verdict: Verdict) -> dict[str, float]:
+def compute_bar_positions(verdict: Verdict) -> dict[str, float]:
     """Return the positions of a verdict's number, interval and baseline on a bar, in percent of its width."""
     value = verdict.value
     if value is None:
         return {}
     low, high = (value if end is None else end for end in (verdict.low, verdict.high))
     values = {"point": value, "baseline": verdict.baseline, "low": low, "high": high}
-    least = min(values.values())
-    inside = (100 - 2 * _BAR_MARGIN) / (max(values.values()) - least or 1.0)
-    return {name: round(_BAR_MARGIN + inside * (position - least), 1) for name, position in values.items()}
+    smallest = min(values.values())
+    scale = (100 - 2 * _BAR_MARGIN) / (max(values.values()) - smallest or 1.0)
+    return {name: round(_BAR_MARGIN + scale * (each - smallest), 1) for name, each in values.items()}
 
 
-def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
-    of_part: dict[str, list[Row]] = {name: [] for name in _PARTS}
+def _make_parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
+    rows_by_part: dict[str, list[Row]] = {name: [] for name in _PARTS}
     for row in rows:
-        of_part[next(name for name, (_, keys) in _PARTS.items() if re.match(keys, row.key))].append(row)
-    images: dict[str, list[PageImage]] = {name: [] for name in _PARTS} | _clips(evaluation)
+        rows_by_part[next(name for name, (_, keys) in _PARTS.items() if re.match(keys, row.key))].append(row)
+    images: dict[str, list[PageImage]] = {name: [] for name in _PARTS} | _draw_clips(evaluation)
     for part, alt, (width, height), draw in evaluation_plots(evaluation):
         images[part].append(PageImage(figure_to_svg(draw, width, height, evaluation), alt))
     notes = {"decoded": () if evaluation.decoded is None else evaluation.decoded.notes}
     return [
-        PagePart(name, title, arrange_tables(of_part[name]), images[name], notes.get(name, ()))
+        PagePart(name, title, arrange_tables(rows_by_part[name]), images[name], notes.get(name, ()))
         for name, (title, _) in _PARTS.items()
     ]
 
 
-def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> list[tuple[str, Row, Row | None]]:
+def _select_tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> list[tuple[str, Row, Row | None]]:
     """Return the most important rows that the summary does not show.
 
-    Each tuple has a label, the row of the evaluated model, and the row of the base model.
+    Each tuple has a label, the row of the evaluated model, and the row of the base model (None: not measured).
     """
     last, ahead = evaluation.horizon, f"{evaluation.seconds_ahead:.1f} s ahead"
     labels = {
@@ -166,25 +166,25 @@ def _tiles(evaluation: Evaluation, rows: Sequence[Row], summary: Summary) -> lis
         del labels[f"rollout.{L1.name}.over_persistence.{last}"]
     if summary.planning is None:
         del labels["ranking.rank"]
-    known = {(row.key, row.model): row for row in rows if not math.isnan(row.value)}
+    measured = {(row.key, row.model): row for row in rows if not math.isnan(row.value)}
     return [
-        (label, known[key, evaluation.trained], known.get((key, evaluation.base or "")))
+        (label, measured[key, evaluation.trained], measured.get((key, evaluation.base or "")))
         for key, label in labels.items()
-        if (key, evaluation.trained) in known
+        if (key, evaluation.trained) in measured
     ]
 
 
-def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
-    """Return images of the example clips, in the best quality within the size limit.
+def _draw_clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
+    """Return the image strips of example clips by part, in the best quality within the size limit.
 
-    Decoded frames are shown if there are any, otherwise the errors of each patch over the true frames.
+    The strips show decoded frames if there are any, otherwise the errors of each patch over the true frames.
     """
     decoded = () if evaluation.decoded is None else evaluation.decoded.strips[:MAX_CLIPS]
     examples = () if decoded else evaluation.examples[:MAX_CLIPS]
     strips = [example_strip(evaluation, clip) for clip in examples] + [
         decoded_strip(evaluation, clip) for clip in decoded
     ]
-    urls = webp_urls([[draw_strip(strip)] for strip in strips], at_most=_BYTES)
+    urls = encode_webp_urls([[draw_strip(strip)] for strip in strips], max_bytes=_MAX_CLIP_BYTES)
     images: dict[str, list[PageImage]] = {"examples": [], "decoded": []}
     shown: list[Example | DecodedStrip] = [*examples, *decoded]
     for url, clip, strip in zip(urls, shown, strips, strict=True):
@@ -195,7 +195,7 @@ def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
 
 
 class PageVideo(NamedTuple):
-    """One clip as a video, with data: URLs."""
+    """A video of one clip, with data: URLs."""
 
     url: str  # the animated image
     still: str  # the last frame
@@ -204,9 +204,9 @@ class PageVideo(NamedTuple):
 
 
 def make_video(evaluation: Evaluation) -> PageVideo | None:
-    """Return a video of the decoded clip with the median error, or of the first one; None: there are no decoded clips.
+    """Return a video of the decoded clip with the median error, or else of the first decoded clip; None: without clips.
 
-    Frame 0 is the true frame in all columns, since all models receive it.
+    The first frame is the true frame in all columns, since all models receive it.
     """
     strips = () if evaluation.decoded is None else evaluation.decoded.strips
     if not strips:
@@ -216,37 +216,37 @@ def make_video(evaluation: Evaluation) -> PageVideo | None:
     true = "truth" if "truth" in strip.rows else "decoded_truth"
     columns = [strip.rows[name] for name in (true, *models)]
     times = range(len(columns[0]))
-    frames = [_frame([column[time] for column in columns], time / times[-1]) for time in times]
+    frames = [_make_frame([column[time] for column in columns], time / times[-1]) for time in times]
     step = min(_STEP_S, (MAX_VIDEO_S - _FIRST_S - _LAST_S) / max(len(times) - 2, 1))
-    shown = [_FIRST_S, *[step] * (len(times) - 2), _LAST_S]
-    (url,), (still,) = (
-        webp_urls([frames], shown, at_most=MAX_VIDEO_BYTES),
-        webp_urls([frames[-1:]], at_most=MAX_VIDEO_BYTES),
-    )
+    seconds = [_FIRST_S, *[step] * (len(times) - 2), _LAST_S]
+    (url,) = encode_webp_urls([frames], seconds, max_bytes=MAX_VIDEO_BYTES)
+    (still,) = encode_webp_urls([frames[-1:]], max_bytes=MAX_VIDEO_BYTES)
     return PageVideo(url, still, ("true frames", *(f"predicted by {name}" for name in models)), strip)
 
 
-def _frame(images: Sequence[Frame], passed: float) -> Frame:
-    """Return images side by side with a progress bar below, for the share `passed` of the time."""
-    thin = max(1, images[0].shape[1] // _THIN)
-    with_gaps = [np.pad(image, ((0, thin), (0, thin), (0, 0)), constant_values=_GREY) for image in images]
-    frame = np.concatenate(with_gaps, axis=1)[:, :-thin]
-    frame[-thin:, : round(passed * frame.shape[1])] = _PASSED
+def _make_frame(images: Sequence[Frame], progress: float) -> Frame:
+    """Return images side by side, with a progress bar below that is filled by the fraction `progress`."""
+    thickness = max(1, images[0].shape[1] // _GAP_RATIO)
+    with_gaps = [np.pad(image, ((0, thickness), (0, thickness), (0, 0)), constant_values=_GREY) for image in images]
+    frame = np.concatenate(with_gaps, axis=1)[:, :-thickness]
+    frame[-thickness:, : round(progress * frame.shape[1])] = _PROGRESS
     return frame
 
 
-def webp_urls(videos: Sequence[Sequence[Frame]], seconds: Sequence[float] = (1.0,), *, at_most: int) -> list[str]:
+def encode_webp_urls(
+    videos: Sequence[Sequence[Frame]], seconds: Sequence[float] = (1.0,), *, max_bytes: int
+) -> list[str]:
     """Encode videos (or images, as single frames) as WebP data: URLs, in the best quality within a size limit.
 
     Args:
         videos: The frames of each video.
         seconds: Display time of each frame.
-        at_most: Largest total size in bytes. If the lowest quality exceeds it, the lowest quality is used.
+        max_bytes: Maximum total size. If the lowest quality exceeds it, the lowest quality is used.
     """
     encoded: list[bytes] = []
     for quality in _QUALITIES:
         encoded = [base64.b64encode(encode_webp(frames, seconds, quality=quality)) for frames in videos]
-        if sum(map(len, encoded)) <= at_most:
+        if sum(map(len, encoded)) <= max_bytes:
             break
     return [f"data:image/webp;base64,{data.decode()}" for data in encoded]
 
@@ -271,7 +271,7 @@ class WrittenEvaluation:
 
 
 def write_evaluation(evaluation: Evaluation, folder: Path) -> WrittenEvaluation:
-    """Write metrics.json, metrics.csv, plot and report of an evaluation, each atomically.
+    """Write metrics.json, metrics.csv, the plot and the page of an evaluation, each file atomically.
 
     The summary includes the planning verdict of a closed-loop benchmark of the same checkpoint, if the run has one.
     """
@@ -279,7 +279,7 @@ def write_evaluation(evaluation: Evaluation, folder: Path) -> WrittenEvaluation:
     summary = summarize(evaluation, rows)
     if about.checkpoint:
         summary = with_closed_loop(summary, Path(about.subject), about.checkpoint)
-    write_atomically(folder / REPORT, report_page(evaluation, summary))
+    write_atomically(folder / REPORT, render_page(evaluation, summary))
     files = (
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE, summary),
