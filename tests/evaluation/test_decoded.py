@@ -1,4 +1,4 @@
-"""A perfect predictor's images are the decoded truth bit for bit."""
+"""Decoded rollouts of predictors with known errors have the expected metrics, images and notes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, clips_batch, in_b
 
 
 def decoder(*, dim: int = DIM, tokens: int = TOKENS, strength: float = 0.25) -> TrainedDecoder:
-    """Return a linear decoder that draws smooth patches; of strength 0 it draws the same grey image of everything."""
+    """Return a linear decoder of smooth patches; with strength 0 all images are grey."""
     shape = DecoderShape("linear", dim, round(tokens**0.5), 16)
     made = Decoder(shape).eval().requires_grad_(False)
     generator = torch.Generator().manual_seed(3)
@@ -38,41 +38,24 @@ def decoder(*, dim: int = DIM, tokens: int = TOKENS, strength: float = 0.25) -> 
 
 
 def clips(batch: LatentBatch, trained: TrainedDecoder, size: int = 4, noise: float = 0.03) -> RepeatableClips:
-    """Return clips whose true frames are the decoder's images with some noise that it cannot draw."""
+    """Return clips whose true frames are decoded images plus noise that the decoder cannot draw."""
     images = trained.decoder.decode(batch.latents)
-    drawn = torch.randn(images.shape[-3:], generator=torch.Generator().manual_seed(4))
-    frames = to_pixels(images + noise * drawn)
-    places = {name: place for place, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True))}
+    fixed_noise = torch.randn(images.shape[-3:], generator=torch.Generator().manual_seed(4))
+    frames = to_pixels(images + noise * fixed_noise)
+    indices = {name: index for index, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True))}
 
     def read(names):  # type: ignore[no-untyped-def]
-        chosen = list(places.values()) if names is None else [places[name] for name in names]
+        chosen = list(indices.values()) if names is None else [indices[name] for name in names]
         for number, part in enumerate(in_batches(rows(batch, chosen), size)):
             yield part, lambda row, first=number * size: frames[chosen[first + row]]
 
-    return RepeatableClips(tuple(places), read)
-
-
-class Known:
-    """Predicts what it was told: the latents of all clips, by their first frame."""
-
-    def __init__(self, latents: Tensor) -> None:
-        self.latents = latents
-
-    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-        """Return nothing of use."""
-        raise NotImplementedError
-
-    def rollout(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-        """Return the frames after the first."""
-        del actions, states, extrinsics
-        clips = [int((self.latents[:, 0] - one).abs().sum(dim=(1, 2)).argmin()) for one in latents[:, 0]]
-        return self.latents[clips, 1:]
+    return RepeatableClips(tuple(indices), read)
 
 
 def evaluated_models(trained: object, base: object | None = None) -> Sequence[EvaluatedModel]:
-    """Return a base, if there is one, and a trained model."""
-    found = [] if base is None else [EvaluatedModel("base", "base", base)]  # type: ignore[arg-type]
-    return [*found, EvaluatedModel("adapter", "trained", trained)]  # type: ignore[arg-type]
+    """Return the trained model, and before it the base model if there is one."""
+    base_models = [] if base is None else [EvaluatedModel("base", "base", base)]  # type: ignore[arg-type]
+    return [*base_models, EvaluatedModel("adapter", "trained", trained)]  # type: ignore[arg-type]
 
 
 TRAINED = decoder()
@@ -88,55 +71,57 @@ def oracle() -> DecodedRollouts:
     return measured(Oracle(), Copier())
 
 
-def of(found: DecodedRollouts, source: str) -> dict[str, list[float]]:
-    curves = {metric: curve for (one, metric), curve in found.curves.items() if one == source}
-    return {metric: [one.value for one in curve] for metric, curve in curves.items()}
+def values_of(decoded: DecodedRollouts, source: str) -> dict[str, list[float]]:
+    curves = {metric: curve for (name, metric), curve in decoded.curves.items() if name == source}
+    return {metric: [estimate.value for estimate in curve] for metric, curve in curves.items()}
 
 
 def test_perfect_predictor_equals_decoded_truth_and_copying_equals_decoded_persistence(
     oracle: DecodedRollouts,
 ) -> None:
     assert oracle.sources == (*BASELINES, "base", "adapter")
-    for source, neighbour in (("adapter", DECODED_TRUTH), ("base", DECODED_PERSISTENCE)):
-        mine, other = of(oracle, source), of(oracle, neighbour)
-        assert mine.keys() == other.keys() >= {"psnr_db.moving.truth", "ssim.whole.decoded_truth"}
-        for metric, one in mine.items():
-            np.testing.assert_array_equal(one, other[metric])
-    assert all(np.isnan(of(oracle, "adapter")["psnr_db.whole.decoded_truth"])), "identical images: infinite"
-    assert of(oracle, "adapter")["ssim.whole.decoded_truth"] == pytest.approx([1.0] * (TIME - 1), abs=1e-6)
+    for source, baseline in (("adapter", DECODED_TRUTH), ("base", DECODED_PERSISTENCE)):
+        of_model, of_baseline = values_of(oracle, source), values_of(oracle, baseline)
+        assert of_model.keys() == of_baseline.keys() >= {"psnr_db.moving.truth", "ssim.whole.decoded_truth"}
+        for metric, values in of_model.items():
+            np.testing.assert_array_equal(values, of_baseline[metric])
+    assert all(np.isnan(values_of(oracle, "adapter")["psnr_db.whole.decoded_truth"])), "identical images: infinite"
+    assert values_of(oracle, "adapter")["ssim.whole.decoded_truth"] == pytest.approx([1.0] * (TIME - 1), abs=1e-6)
 
 
 def test_half_motion_predictor_scores_between_persistence_and_truth() -> None:
-    found = measured(Halfway())
+    decoded = measured(Halfway())
     for metric in ("psnr_db.whole.truth", "ssim.moving.truth"):
-        low, mine, high = (of(found, one)[metric] for one in (DECODED_PERSISTENCE, "adapter", DECODED_TRUTH))
-        assert all(a < b < c for a, b, c in zip(low, mine, high, strict=True))
+        low, middle, high = (
+            values_of(decoded, source)[metric] for source in (DECODED_PERSISTENCE, "adapter", DECODED_TRUTH)
+        )
+        assert all(a < b < c for a, b, c in zip(low, middle, high, strict=True))
 
 
 def test_static_clip_is_excluded_from_moving_region_metrics() -> None:
     still = replace(BATCH, latents=BATCH.latents.clone(), actions=BATCH.actions.clone())
     still.latents[:3] = still.latents[:3, :1]
-    found = measure_decoded(evaluated_models(Copier()), clips(still, TRAINED), TRAINED)
+    decoded = measure_decoded(evaluated_models(Copier()), clips(still, TRAINED), TRAINED)
     rest = replace(BATCH, **{
         name: getattr(BATCH, name)[3:] for name in ("latents", "actions", "states", "episode_ids", "starts")
     })  # fmt: skip
     without = measure_decoded(evaluated_models(Copier()), clips(rest, TRAINED), TRAINED)
     key = ("adapter", "psnr_db.moving.truth")
-    assert found.curves[key][0].value == pytest.approx(without.curves[key][0].value, rel=1e-5)
-    assert any("3 clips are left out" in note for note in found.notes)
+    assert decoded.curves[key][0].value == pytest.approx(without.curves[key][0].value, rel=1e-5)
+    assert any("3 clips are left out" in note for note in decoded.notes)
 
 
 def test_cached_latents_are_not_compared_with_true_frames() -> None:
-    found = measure_decoded(evaluated_models(Oracle()), replace(clips(BATCH, TRAINED), has_frames=False), TRAINED)
-    assert not [metric for _, metric in found.curves if metric.endswith(".truth") or ".moving." in metric]
-    assert "come from a cache" in found.notes[0]
-    assert found.sources == (DECODED_TRUTH, DECODED_PERSISTENCE, "adapter")
+    decoded = measure_decoded(evaluated_models(Oracle()), replace(clips(BATCH, TRAINED), has_frames=False), TRAINED)
+    assert not [metric for _, metric in decoded.curves if metric.endswith(".truth") or ".moving." in metric]
+    assert "come from a cache" in decoded.notes[0]
+    assert decoded.sources == (DECODED_TRUTH, DECODED_PERSISTENCE, "adapter")
 
 
 def test_decoded_strips_start_with_the_input_frame() -> None:
     example = Example("best", BATCH.episode_ids[3], BATCH.starts[3], None, {})
-    found = measure_decoded(evaluated_models(Oracle()), clips(BATCH, TRAINED), TRAINED, [example])
-    (strip,) = found.strips
+    decoded = measure_decoded(evaluated_models(Oracle()), clips(BATCH, TRAINED), TRAINED, [example])
+    (strip,) = decoded.strips
     assert list(strip.rows) == ["truth", "decoded_truth", "adapter"]
     np.testing.assert_array_equal(strip.rows["adapter"], strip.rows["decoded_truth"])
     assert len(strip.rows["truth"]) == TIME
@@ -148,7 +133,7 @@ def test_fvd_of_images_is_lowest_for_the_decoded_truth_and_needs_the_encoder() -
     def encode(images: Tensor) -> Tensor:
         return images.mean(dim=(-2, -1)).repeat(1, 1, 2)[:, :, None]
 
-    found = measure_decoded(evaluated_models(Oracle(), Copier()), clips(BATCH, TRAINED), TRAINED, encode=encode).fvd
-    assert list(found) == [DECODED_TRUTH, DECODED_PERSISTENCE, "base", "adapter"]
-    assert found["adapter"] == found[DECODED_TRUTH]
-    assert found["base"] == found[DECODED_PERSISTENCE]
+    decoded = measure_decoded(evaluated_models(Oracle(), Copier()), clips(BATCH, TRAINED), TRAINED, encode=encode)
+    assert list(decoded.fvd) == [DECODED_TRUTH, DECODED_PERSISTENCE, "base", "adapter"]
+    assert decoded.fvd["adapter"] == decoded.fvd[DECODED_TRUTH]
+    assert decoded.fvd["base"] == decoded.fvd[DECODED_PERSISTENCE]

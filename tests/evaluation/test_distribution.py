@@ -1,4 +1,4 @@
-"""Spread is a ratio of traces of covariances; the MMD is 0 if nothing differs, and does not reward smoothing."""
+"""The spread is a ratio of traces of covariances. The MMD of equal distributions is 0, and smoothing raises it."""
 
 import math
 
@@ -20,12 +20,12 @@ IDS = tuple(f"episode {clip % EPISODES}" for clip in range(CLIPS))
 
 
 def latents(seed: int, spread: float = 1.0, tokens: int = 9, dim: int = 24) -> torch.Tensor:
-    """Return latents about a common mean, alike within an episode, as varied as `spread` says."""
+    """Return latents that are similar within an episode, with a common mean and a variance proportional to `spread`."""
     generator = torch.Generator().manual_seed(seed)
     mean = torch.linspace(-1, 1, tokens * dim).reshape(1, 1, tokens, dim)
     of_episode = torch.randn(EPISODES, 2, tokens, dim, generator=generator).repeat(CLIPS // EPISODES, 1, 1, 1)
-    own = torch.randn(CLIPS, 2, tokens, dim, generator=generator)
-    return mean + math.sqrt(spread) * (0.6 * of_episode + 0.8 * own)
+    of_clip = torch.randn(CLIPS, 2, tokens, dim, generator=generator)
+    return mean + math.sqrt(spread) * (0.6 * of_episode + 0.8 * of_clip)
 
 
 def summed(values: torch.Tensor, batch: int = 5) -> LatentSums:
@@ -42,40 +42,41 @@ def trace(values: torch.Tensor) -> np.ndarray:
 
 def test_spread_is_the_ratio_of_the_traces_of_the_covariances() -> None:
     predicted, true = latents(1, spread=0.5), latents(2)
-    found = relative_spread(summed(predicted), summed(true))
-    assert [one.value for one in found] == pytest.approx(trace(predicted) / trace(true))
-    assert not any(one.has_interval for one in found)
+    spreads = relative_spread(summed(predicted), summed(true))
+    assert [spread.value for spread in spreads] == pytest.approx(trace(predicted) / trace(true))
+    assert not any(spread.has_interval for spread in spreads)
 
 
 def test_latents_as_varied_as_the_truth_have_spread_1() -> None:
     true = latents(2)
-    assert [one.value for one in relative_spread(summed(latents(3)), summed(true))] == pytest.approx([1, 1], abs=0.3)
-    (one, other) = relative_spread(summed(true + 5), summed(true))  # where their mean is does not matter
-    assert (one.value, other.value) == pytest.approx((1, 1))
+    spreads = relative_spread(summed(latents(3)), summed(true))
+    assert [spread.value for spread in spreads] == pytest.approx([1, 1], abs=0.3)
+    spreads = relative_spread(summed(true + 5), summed(true))  # the spread does not depend on the mean
+    assert [spread.value for spread in spreads] == pytest.approx([1, 1])
 
 
 def test_mmd_averages_latents_over_tokens_and_fvd_also_over_frames() -> None:
     predicted, true = latents(1, spread=0.5), latents(2)
-    found = compare_distributions(summed(predicted), summed(true))
+    distribution = compare_distributions(summed(predicted), summed(true))
     pooled = [values.mean(dim=2).double().numpy() for values in (predicted, true)]
-    assert found.mmd[1].value == pytest.approx(mmd(pooled[0][:, 1], pooled[1][:, 1], IDS).value, rel=1e-4)
-    assert found.fvd == pytest.approx(frechet_distance(*(values.mean(axis=1) for values in pooled)), rel=1e-4)
+    assert distribution.mmd[1].value == pytest.approx(mmd(pooled[0][:, 1], pooled[1][:, 1], IDS).value, rel=1e-4)
+    assert distribution.fvd == pytest.approx(frechet_distance(*(values.mean(axis=1) for values in pooled)), rel=1e-4)
     assert frechet_distance_of_halves(summed(true)) > 0
 
 
-def test_single_clip_has_no_distribution_and_single_episode_no_interval() -> None:
-    alone = LatentSums()
-    alone.add(latents(1)[:1], IDS[:1])
-    found = compare_distributions(alone, alone)
-    assert all(math.isnan(one.value) for one in (*found.spread, *found.mmd))
-    assert math.isnan(found.fvd)
-    same = LatentSums()
-    same.add(latents(1)[:3], ["only"] * 3)
-    assert relative_spread(same, same)[0].value == pytest.approx(1)
-    assert math.isnan(compare_distributions(same, same).mmd[0].value)
+def test_single_clip_has_no_distribution_and_single_episode_no_mmd() -> None:
+    one_clip = LatentSums()
+    one_clip.add(latents(1)[:1], IDS[:1])
+    distribution = compare_distributions(one_clip, one_clip)
+    assert all(math.isnan(estimate.value) for estimate in (*distribution.spread, *distribution.mmd))
+    assert math.isnan(distribution.fvd)
+    one_episode = LatentSums()
+    one_episode.add(latents(1)[:3], ["only"] * 3)
+    assert relative_spread(one_episode, one_episode)[0].value == pytest.approx(1)
+    assert math.isnan(compare_distributions(one_episode, one_episode).mmd[0].value)
 
 
-# ---- the Fréchet distance -------------------------------------------------------------------------------------------
+# ---- the Fréchet distance ----
 
 
 @pytest.mark.parametrize("count", [400, 6])
@@ -90,27 +91,27 @@ def test_frechet_distance_equals_the_matrix_root_formula_for_few_and_many_clips(
     assert frechet_distance(one, one + 2) == pytest.approx(8 * 4)
 
 
-# ---- the MMD ---------------------------------------------------------------------------------------------------------
+# ---- the MMD ----
 
 DIM, MMD_EPISODES, MMD_CLIPS = 256, 30, 4
 MMD_IDS = tuple(f"episode {number}" for number in range(MMD_EPISODES) for _ in range(MMD_CLIPS))
-SCALES = np.arange(1, DIM + 1) ** -0.25  # a spectrum of 1/sqrt(k): many directions, as features have
+SCALES = np.arange(1, DIM + 1) ** -0.25  # variances 1/sqrt(k): as in real features, many directions matter
 MEAN = 0.2 * np.cos(np.arange(DIM))
 
 
 def features(rng: np.random.Generator) -> np.ndarray:
-    """Return features of clips that are alike within an episode."""
+    """Return features of clips that are similar within an episode."""
     of_episode = np.repeat(rng.standard_normal((MMD_EPISODES, DIM)), MMD_CLIPS, axis=0)
     return MEAN + SCALES * (0.8 * of_episode + 0.6 * rng.standard_normal((len(MMD_IDS), DIM)))
 
 
 def equally_spread(rng: np.random.Generator, true: np.ndarray) -> np.ndarray:
-    """Return predictions that are off, but distributed as the truth: correlated with it by 0.8."""
+    """Return inaccurate predictions with the distribution of the true features, and a correlation of 0.8 with them."""
     return MEAN + 0.8 * (true - MEAN) + 0.6 * (features(rng) - MEAN)
 
 
 def smoothed(rng: np.random.Generator, true: np.ndarray) -> np.ndarray:
-    """Return predictions that are off as far, with 20 % less spread."""
+    """Return predictions that are equally inaccurate, with 20 % smaller deviations from the mean."""
     return MEAN + 0.8 * (equally_spread(rng, true) - MEAN)
 
 
@@ -123,24 +124,24 @@ def test_mmd_of_equal_distributions_has_expectation_zero() -> None:
     assert abs(np.mean(values)) < 3 * np.std(values) / math.sqrt(len(values))
 
 
-def test_smoothed_predictions_score_worse_than_equally_spread_ones() -> None:
-    ours = []
+def test_smoothed_predictions_have_a_higher_mmd_than_equally_spread_predictions() -> None:
+    values = []
     for seed in range(30):
         rng = np.random.default_rng(seed)
         true = features(rng)
-        ours.append([mmd(one, true, MMD_IDS).value for one in (smoothed(rng, true), equally_spread(rng, true))])
-    smooth, spread = np.mean(ours, axis=0)
-    assert smooth > spread + 3 * np.std(np.subtract(*np.transpose(ours))) / math.sqrt(30)
+        values.append([mmd(each, true, MMD_IDS).value for each in (smoothed(rng, true), equally_spread(rng, true))])
+    smooth, spread = np.mean(values, axis=0)
+    assert smooth > spread + 3 * np.std(np.subtract(*np.transpose(values))) / math.sqrt(30)
 
 
-def test_mmd_interval_contains_a_real_difference() -> None:
+def test_mmd_interval_of_different_distributions_contains_the_exact_value() -> None:
     rng = np.random.default_rng(0)
     true = features(rng)
-    found = mmd(0.6 * equally_spread(rng, true), true, MMD_IDS)
+    estimate = mmd(0.6 * equally_spread(rng, true), true, MMD_IDS)
     moment = np.diag(SCALES**2) + np.outer(MEAN, MEAN)
     exact = 100 * float(((1 - 0.36) ** 2 * moment**2).sum()) / DIM**2
-    assert found.low < exact < found.high
-    assert found.low > 0
+    assert estimate.low < exact < estimate.high
+    assert estimate.low > 0
 
 
 def test_mmd_equals_the_sum_over_clip_pairs_from_different_episodes() -> None:

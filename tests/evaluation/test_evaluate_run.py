@@ -1,4 +1,4 @@
-"""Runs and models are evaluated on their own or other data, against others, with a decoder; wrong input is refused."""
+"""Runs and models are evaluated on any data, compared with other models, and decoded; invalid input raises."""
 
 import json
 from collections.abc import Callable
@@ -28,7 +28,7 @@ from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.training.loop import train
 
 PROBES = ProbeOptions(ranking_clips=3, samples=6, landscape_clips=1, nodes=3, examples=1)
-NONE = ProbeOptions(ranking_clips=0, examples=0)
+NO_PROBES = ProbeOptions(ranking_clips=0, examples=0)
 FEW = ["--ranking-clips", "0", "--examples", "1", "--clips", "5"]
 QUICK = ["--ranking-clips=3", "--samples=6", "--landscapes=1", "--nodes=3", "--examples=1"]
 
@@ -52,37 +52,37 @@ def run(config: Config) -> str:
     return config.run_dir
 
 
-def asked(**changes: Any) -> EvaluationOptions:
+def make_options(**changes: Any) -> EvaluationOptions:
     return EvaluationOptions(**({"clips": 5, "probes": PROBES} | changes))
 
 
 def measure(subject: str, options: EvaluationOptions) -> WrittenEvaluation:
-    """Evaluate and write the files, as the command does."""
+    """Evaluate and write the files, like the command."""
     return write_evaluation(evaluate_subject(subject, options), options.out or Path(subject))
 
 
 @pytest.fixture(scope="module")
 def measured(config: Config) -> WrittenEvaluation:
-    """The run's evaluation, which is in its folder, too: to be read only."""
+    """Evaluate the run; the files are in the folder of the run, and tests must not change them."""
     with one_thread():
-        return measure(config.run_dir, asked())
+        return measure(config.run_dir, make_options())
 
 
-def written(config: Config, folder: Path, **data: object) -> str:
-    """Write a config, its data changed, and return its path."""
+def write_config(config: Config, folder: Path, **data: object) -> str:
+    """Write a config with changed keys of `data`, and return the path."""
     values = config_as_dict(config)
     values["data"] |= data
-    path = folder / "config of the data.yaml"
+    path = folder / "data_config.yaml"
     path.write_text(yaml.safe_dump(values))
     return str(path)
 
 
-def rollout(metrics: dict[str, Any], name: str) -> list[float]:
+def rollout_ratios(metrics: dict[str, Any], name: str) -> list[float]:
     ratios = [row for row in metrics["rows"] if row["key"].startswith("rollout.l1.over_persistence.")]
     return [row["value"] for row in ratios if row["model"] == name]
 
 
-def figures_of(folder: Path | str) -> dict[str, Any]:
+def read_json(folder: Path | str) -> dict[str, Any]:
     return json.loads((Path(folder) / "metrics.json").read_text())
 
 
@@ -99,64 +99,64 @@ def test_run_is_compared_with_its_base_model_in_all_measurements(measured: Writt
 
 
 @pytest.mark.usefixtures("measured")
-def test_metrics_do_not_depend_on_batch_size_or_workers(config: Config, run: str, tmp_path: Path) -> None:
+def test_metrics_do_not_depend_on_the_batch_size(config: Config, run: str, tmp_path: Path) -> None:
     changed = config.model_copy(update={"validation": config.validation.model_copy(update={"batch_size": 2})})
     path = Path(run) / "config.yaml"
     before = path.read_text()
     try:
         path.write_text(yaml.safe_dump(config_as_dict(changed)))
-        measure(run, asked(out=tmp_path / "b"))
+        measure(run, make_options(out=tmp_path / "b"))
     finally:
         path.write_text(before)
-    one, other = figures_of(run), figures_of(tmp_path / "b")
+    by_three, by_two = read_json(run), read_json(tmp_path / "b")
     for name in ("base", "adapter"):
-        assert rollout(one, name) == pytest.approx(rollout(other, name), rel=1e-5)
-        ranks = [metrics["models"][name]["ranking"]["ranks"] for metrics in (one, other)]
+        assert rollout_ratios(by_three, name) == pytest.approx(rollout_ratios(by_two, name), rel=1e-5)
+        ranks = [metrics["models"][name]["ranking"]["ranks"] for metrics in (by_three, by_two)]
         assert ranks[0] == ranks[1]
-    assert one["clips"] == other["clips"]
+    assert by_three["clips"] == by_two["clips"]
 
 
 @pytest.mark.usefixtures("measured")
 def test_a_model_is_measured_on_the_data_of_a_config_and_equals_the_base_of_a_run(
     config: Config, run: str, tmp_path: Path, base_folder: Path
 ) -> None:
-    path = written(config, tmp_path)
+    path = write_config(config, tmp_path)
     arguments = ["evaluate", str(base_folder), "--data", path, "--out", str(tmp_path / "model"), "--clips", "5", *QUICK]
     assert main(arguments) == 0
-    of_model = figures_of(tmp_path / "model")
+    of_model = read_json(tmp_path / "model")
     assert list(of_model["models"]) == ["model"]
     assert of_model["base"] is None
     assert of_model["about"]["checkpoint"] == ""
-    assert rollout(of_model, "model") == pytest.approx(rollout(figures_of(run), "base"), rel=1e-5)
+    assert rollout_ratios(of_model, "model") == pytest.approx(rollout_ratios(read_json(run), "base"), rel=1e-5)
 
 
 def test_other_runs_are_measured_on_the_same_latents(run: str, tmp_path: Path, base_folder: Path) -> None:
-    found = measure(run, asked(against=("base", run, str(base_folder)), out=tmp_path))
-    assert list(found.evaluation.models) == ["base", "run", "model", "adapter"]
-    assert [model.role for model in found.evaluation.models.values()] == ["base", "other", "other", "trained"]
-    metrics = figures_of(tmp_path)
-    assert rollout(metrics, "run") == pytest.approx(rollout(metrics, "adapter"), rel=1e-6)
-    assert rollout(metrics, "model") == pytest.approx(rollout(metrics, "base"), rel=1e-6)
-    assert rollout(metrics, "base") != rollout(metrics, "adapter")
-    asked_without = asked(against=(str(base_folder),), out=tmp_path, probes=NONE)
-    assert evaluate_subject(run, asked_without).base is None
+    result = measure(run, make_options(against=("base", run, str(base_folder)), out=tmp_path))
+    assert list(result.evaluation.models) == ["base", "run", "model", "adapter"]
+    assert [model.role for model in result.evaluation.models.values()] == ["base", "other", "other", "trained"]
+    metrics = read_json(tmp_path)
+    assert rollout_ratios(metrics, "run") == pytest.approx(rollout_ratios(metrics, "adapter"), rel=1e-6)
+    assert rollout_ratios(metrics, "model") == pytest.approx(rollout_ratios(metrics, "base"), rel=1e-6)
+    assert rollout_ratios(metrics, "base") != rollout_ratios(metrics, "adapter")
+    options = make_options(against=(str(base_folder),), out=tmp_path, probes=NO_PROBES)
+    assert evaluate_subject(run, options).base is None
 
 
-def test_measuring_a_run_with_another_encoder_raises(run: str, tmp_path: Path, base_folder: Path) -> None:
+def test_comparing_with_a_model_that_has_another_encoder_raises(run: str, tmp_path: Path, base_folder: Path) -> None:
     model = WorldModel.from_pretrained(base_folder)
     WorldModel.random(model.sizes, seed=9).save_pretrained(tmp_path / "other")
     with pytest.raises(InputError, match=r"an encoder that differs from that of.*vjepa2-ac compare"):
-        evaluate_subject(run, asked(against=(str(tmp_path / "other"),)))
+        evaluate_subject(run, make_options(against=(str(tmp_path / "other"),)))
 
 
 @pytest.mark.usefixtures("measured")
 def test_cached_latents_give_the_metrics_of_frames(config: Config, run: str, tmp_path: Path) -> None:
     encode_for(config, load_base(config.model, seed=0), open_dataset(config.data))
-    path = written(config, tmp_path, cache="require")
+    path = write_config(config, tmp_path, cache="require")
     assert main(["evaluate", run, "--data", path, "--out", str(tmp_path / "cached"), "--clips", "5", *QUICK]) == 0
-    fly, cached = figures_of(run), figures_of(tmp_path / "cached")
-    assert (fly["models"], fly["rows"]) == (cached["models"], cached["rows"])
-    assert fly["clips"] == cached["clips"]
+    from_frames, cached = read_json(run), read_json(tmp_path / "cached")
+    assert (from_frames["models"], from_frames["rows"]) == (cached["models"], cached["rows"])
+    assert from_frames["clips"] == cached["clips"]
 
 
 def test_run_without_base_model_is_measured_alone_or_raises_if_base_is_requested(
@@ -164,35 +164,37 @@ def test_run_without_base_model_is_measured_alone_or_raises_if_base_is_requested
 ) -> None:
     config = make_config(model__base="random", model__sizes=TINY_CONFIG, adapter__kind="none")
     folder, dataset = write_adapted_run(config), open_dataset(config.data)
-    assert [one.role for one in load_models(str(folder), config, asked(), dataset).evaluated_models] == ["trained"]
+    assert [each.role for each in load_models(str(folder), config, make_options(), dataset).evaluated_models] == [
+        "trained"
+    ]
     with pytest.raises(InputError, match=r"--against base: a model without a base"):
-        load_models(str(folder), config, asked(against=("base",)), dataset)
+        load_models(str(folder), config, make_options(against=("base",)), dataset)
 
 
 def changed(config: Config, **data: object) -> Config:
-    """Return a config with other settings of its data."""
+    """Return a config with changed keys of `data`."""
     return config.model_copy(update={"data": config.data.model_copy(update=data)})
 
 
-WRONG: dict[str, tuple[Callable[[Config], EvaluationOptions], str]] = {
-    "other data without a folder": (lambda config: asked(data=config), "--data without --out"),
-    "a stride to be found out": (
-        lambda config: asked(data=changed(config, stride="auto"), out=Path("unused")),
+INVALID_INPUT: dict[str, tuple[Callable[[Config], EvaluationOptions], str]] = {
+    "other data without a folder": (lambda config: make_options(data=config), "--data without --out"),
+    "an automatic stride": (
+        lambda config: make_options(data=changed(config, stride="auto"), out=Path("unused")),
         "data.stride: auto",
     ),
     "an empty split": (
-        lambda config: asked(data=changed(config, test_share=0.0), out=Path(config.run_dir) / "out"),
+        lambda config: make_options(data=changed(config, test_share=0.0), out=Path(config.run_dir) / "out"),
         "no test episodes",
     ),
     "clips longer than episodes": (
-        lambda config: asked(data=changed(config, frames=30), out=Path(config.run_dir) / "out"),
+        lambda config: make_options(data=changed(config, frames=30), out=Path(config.run_dir) / "out"),
         "shorter than a clip",
     ),
-    "no such checkpoint": (lambda _: asked(checkpoint="7"), "no checkpoint of step 7"),
+    "no such checkpoint": (lambda _: make_options(checkpoint="7"), "no checkpoint of step 7"),
 }
 
 
-@pytest.mark.parametrize(("make", "words"), WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize(("make", "words"), INVALID_INPUT.values(), ids=INVALID_INPUT)
 def test_invalid_input_is_reported_before_a_model_is_loaded(
     config: Config, run: str, make: Callable[[Config], EvaluationOptions], words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,22 +203,24 @@ def test_invalid_input_is_reported_before_a_model_is_loaded(
         evaluate_subject(run, make(config))
 
 
-def test_model_without_data_and_occupied_output_raise(run: str, tmp_path: Path, base_folder: Path) -> None:
+def test_model_without_data_missing_checkpoint_and_file_as_output_folder_raise(
+    run: str, tmp_path: Path, base_folder: Path
+) -> None:
     with pytest.raises(InputError, match=r"no config\.yaml.*--data CONFIG"):
-        evaluate_subject(str(base_folder), asked())
+        evaluate_subject(str(base_folder), make_options())
     with pytest.raises(InputError, match="no such folder"):
-        evaluate_subject(str(tmp_path / "nowhere"), asked())
+        evaluate_subject(str(tmp_path / "nowhere"), make_options())
     (tmp_path / "config.yaml").touch()
     with pytest.raises(InputError, match=r"a config file\. Expected the folder of a run"):
-        evaluate_subject(str(tmp_path / "config.yaml"), asked())
+        evaluate_subject(str(tmp_path / "config.yaml"), make_options())
     with pytest.raises(InputError, match=r"no checkpoint of step 17\. Expected"):
-        resolve_config(run, asked(checkpoint="17"))
+        resolve_config(run, make_options(checkpoint="17"))
     (tmp_path / "file").touch()
     with pytest.raises((InputError, OSError), match="file"):
-        evaluate_subject(run, asked(out=tmp_path / "file"))
+        evaluate_subject(run, make_options(out=tmp_path / "file"))
 
 
-# ---- with a decoder --------------------------------------------------------------------------------------------------
+# ---- with a decoder ----
 
 
 def card_of(config: Config) -> DecoderCard:
@@ -226,7 +230,7 @@ def card_of(config: Config) -> DecoderCard:
     return DecoderCard("vjepa2-ac decoder 1", shape, encoder, "released", "fp32", "data", ("camera",), 3, 30, 100)
 
 
-def saved(card: DecoderCard, folder: Path) -> str:
+def write_decoder(card: DecoderCard, folder: Path) -> str:
     weights = Decoder(card.shape).state_dict()
     save_decoder(folder, card, weights)
     return str(folder)
@@ -234,7 +238,7 @@ def saved(card: DecoderCard, folder: Path) -> str:
 
 @pytest.fixture(scope="module")
 def decoder(config: Config, tmp_path_factory: pytest.TempPathFactory) -> str:
-    return saved(card_of(config), tmp_path_factory.mktemp("decoder") / "decoder")
+    return write_decoder(card_of(config), tmp_path_factory.mktemp("decoder") / "decoder")
 
 
 def test_a_decoder_adds_rows_and_images_and_changes_nothing_else(
@@ -251,7 +255,7 @@ def test_a_decoder_adds_rows_and_images_and_changes_nothing_else(
     assert tuple(row for row in metrics.rows if row not in added) == without.rows
     assert {row.model for row in added} >= {"decoded truth", "raw persistence", "base", "adapter"}
     assert (metrics.of("decoded.psnr_db.whole.truth.3") or added[0]).value > 0  # type: ignore[operator]
-    assert "decoded truth" not in capsys.readouterr().out, "it stands behind --all"
+    assert "decoded truth" not in capsys.readouterr().out, "these rows need --all"
     page = (tmp_path / "report.html").read_text()
     assert "Decoded images compared with the truth: PSNR (dB), whole image" in page
 
@@ -261,8 +265,8 @@ def test_decoded_images_from_a_latent_cache_are_compared_with_decoded_truth(
 ) -> None:
     encode_for(config, load_base(config.model, seed=0), open_dataset(config.data))
     data = changed(config, cache="auto")
-    measure(config.run_dir, EvaluationOptions(clips=5, data=data, out=tmp_path, decoder=decoder, probes=NONE))
-    found = read_metrics(tmp_path)
-    assert found.of("decoded.ssim.whole.truth.3") is None
+    measure(config.run_dir, EvaluationOptions(clips=5, data=data, out=tmp_path, decoder=decoder, probes=NO_PROBES))
+    metrics = read_metrics(tmp_path)
+    assert metrics.of("decoded.ssim.whole.truth.3") is None
     for key in ("decoded.ssim.whole.decoded_truth.3", "fvd.decoded"):
-        assert (found.of(key) or found.rows[0]).key == key
+        assert (metrics.of(key) or metrics.rows[0]).key == key

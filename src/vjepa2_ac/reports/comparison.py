@@ -217,8 +217,8 @@ def _have_same_base(measured: Iterable[Metrics]) -> bool:
 
 def _make_notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
     persistence = {name: _get_last_errors(metrics)[1].mean() for name, metrics in measured.items()}
-    first, *others = measured
-    different = [name for name in others if abs(persistence[name] / persistence[first] - 1) > _SAME_LATENTS]
+    first, *later_runs = measured
+    different = [name for name in later_runs if abs(persistence[name] / persistence[first] - 1) > _SAME_LATENTS]
     notes = []
     if different:
         notes.append(
