@@ -77,18 +77,18 @@ def decoder(tmp_path_factory: pytest.TempPathFactory) -> TrainedDecoder:
 
 
 def test_plan_images_are_the_decoded_rollout_of_its_actions(decoder: TrainedDecoder) -> None:
-    answer = make_plan_result(100, 101, nodes=0, horizon=3)
-    found = imagine_plan(answer, decoder)
-    plan, cost = answer.decision.plan, answer.decision.cost
+    result = make_plan_result(100, 101, nodes=0, horizon=3)
+    images = imagine_plan(result, decoder)
+    plan, cost = result.decision.plan, result.decision.cost
     assert plan is not None
     assert cost is not None
     with torch.no_grad():
         latents, _ = cost.rollout(plan.actions[None])
-    assert list(found.steps) == [1, 2, 3]
-    assert np.array_equal(np.stack([*found.steps.values()]), decode_views(decoder.decoder, latents[0]))
-    encoded = torch.stack([answer.controller.encode(image(seed)) for seed in (0, 101)])
-    assert np.array_equal(np.stack([found.start, found.decoded_goal]), decode_views(decoder.decoder, encoded))
-    assert np.array_equal(found.goal, to_display_frames(crop_frames(image(101)[None]), 48)[0])
+    assert list(images.steps) == [1, 2, 3]
+    assert np.array_equal(np.stack([*images.steps.values()]), decode_views(decoder.decoder, latents[0]))
+    encoded = torch.stack([result.controller.encode(image(seed)) for seed in (0, 101)])
+    assert np.array_equal(np.stack([images.start, images.decoded_goal]), decode_views(decoder.decoder, encoded))
+    assert np.array_equal(images.goal, to_display_frames(crop_frames(image(101)[None]), 48)[0])
 
 
 def test_long_plan_shows_eight_steps_including_the_last(decoder: TrainedDecoder) -> None:
@@ -97,7 +97,7 @@ def test_long_plan_shows_eight_steps_including_the_last(decoder: TrainedDecoder)
     assert [min(steps), max(steps)] == [1, 11]
 
 
-@pytest.mark.parametrize("answer", [{"start": 100}, {"broken": True}])
-def test_no_images_without_a_plan_or_finite_predictions(decoder: TrainedDecoder, answer: dict) -> None:
-    answer = make_plan_result(nodes=0, **answer)
-    assert imagine_plan(answer, decoder).steps == {}
+@pytest.mark.parametrize("options", [{"start": 100}, {"broken": True}])
+def test_no_images_without_a_plan_or_finite_predictions(decoder: TrainedDecoder, options: dict) -> None:
+    result = make_plan_result(nodes=0, **options)
+    assert imagine_plan(result, decoder).steps == {}

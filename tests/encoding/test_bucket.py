@@ -1,4 +1,4 @@
-"""A latent cache in a bucket: written completely, found by one listing, read in ranges, with network failures."""
+"""A latent cache in a bucket: complete files only, one listing, range reads, and network failures."""
 
 import os
 import time
@@ -25,27 +25,27 @@ from vjepa2_ac.training.loop import train
 
 URL = "gs://bucket/caches"
 EPISODES, CLIPS = 8, 12
-SMALL = 2600  # bytes: header and numbers of an episode
-ALWAYS = 10_000  # times
+HEADER_BYTES = 2600  # header, states and actions of an episode
+ALWAYS = 10_000  # number of failures that a test does not reach
 
 
 @pytest.fixture(autouse=True)
 def _small_heads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read smaller file heads, because the files of these episodes are small."""
+    """Read smaller file heads, because the files of these tests are small."""
     monkeypatch.setattr("vjepa2_ac.data.sources.latent_files._HEAD_BYTES", 512)
 
 
 @pytest.fixture
 def bucket(gcs: Gcs) -> Gcs:
-    """A bucket that has another file."""
-    gcs.put("bucket/other", b"another's")
+    """A bucket that contains another file."""
+    gcs.put("bucket/other", b"another file")
     gcs.forget()
     return gcs
 
 
 @pytest.fixture
 def bucket_config(make_config: MakeConfig, tmp_path: Path) -> Callable[..., Config]:
-    """Return a config whose cache is in the bucket, on a machine of this name."""
+    """Return a function that makes a config for a machine: its own disk cache, and the latent cache in the bucket."""
 
     def make(machine: str = "one", **changes: object) -> Config:
         disk = {"dir": str(tmp_path / machine), "limit_gb": 1.0}
@@ -56,20 +56,20 @@ def bucket_config(make_config: MakeConfig, tmp_path: Path) -> Callable[..., Conf
 
 
 def batches(dataset: Dataset) -> list[torch.Tensor]:
-    """Return the latents of the first clips; the loader works in this process."""
+    """Return the latents and states of the first clips, read in this process."""
     loader = training_loader(dataset, seed=3, batch_size=2)
-    return [part for batch in islice(loader, 6) for part in (batch.latents.values, batch.latents.scales, batch.states)
-            if part is not None]  # fmt: skip
+    return [value for batch in islice(loader, 6) for value in (batch.latents.values, batch.latents.scales, batch.states)
+            if value is not None]  # fmt: skip
 
 
-def opened(config: Config) -> Dataset:
-    found = use_finished_cache(config, open_dataset(config.data), load_base(config.model, seed=config.seed))
-    assert found.config.is_cache
-    return found
+def open_cached(config: Config) -> Dataset:
+    dataset = use_finished_cache(config, open_dataset(config.data), load_base(config.model, seed=config.seed))
+    assert dataset.config.is_cache
+    return dataset
 
 
 def open_cache_only(config: Config, folder: Path | str, **changes: object) -> Dataset:
-    """Return the data of a finished cache without its data set."""
+    """Open a finished cache without the data set from which it was encoded."""
     return open_dataset(config.data.with_source("latents", path=str(folder), cache="off", **changes))
 
 
@@ -77,8 +77,8 @@ def latents_in(bucket: Gcs) -> list[str]:
     return [name for name in bucket.names("bucket") if name.endswith(".safetensors")]
 
 
-def equal(one: list[torch.Tensor], other: list[torch.Tensor]) -> bool:
-    return len(one) == len(other) > 0 and all(map(torch.equal, one, other))
+def are_equal(actual: list[torch.Tensor], expected: list[torch.Tensor]) -> bool:
+    return len(actual) == len(expected) > 0 and all(map(torch.equal, actual, expected))
 
 
 # ---- writing and reading -----------------------------------------------------------------------------------------
@@ -88,20 +88,20 @@ def test_second_machine_completes_a_cache_in_a_bucket(
     bucket: Gcs, bucket_config: Callable[..., Config], encoded_frames: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
-    found = encode_config(bucket_config("one"))
-    assert (found.encoded, found.is_finished) == (EPISODES // 2, False)
+    result = encode_config(bucket_config("one"))
+    assert (result.encoded, result.is_finished) == (EPISODES // 2, False)
     encoded_frames.clear()
     monkeypatch.delenv("WORLD_SIZE")
-    found = encode_config(bucket_config("two"))
+    result = encode_config(bucket_config("two"))
     assert sum(encoded_frames) == EPISODES // 2 * 24
     encoded_frames.clear()
     bucket.forget()
-    assert encode_config(bucket_config("three")) == found
-    assert (found.encoded, found.is_finished, found.folder) == (EPISODES, True, f"{URL}/{found.folder[-32:]}")
+    assert encode_config(bucket_config("three")) == result
+    assert (result.encoded, result.is_finished, result.folder) == (EPISODES, True, f"{URL}/{result.folder[-32:]}")
     assert not encoded_frames
     assert not bucket.uploads()
-    sizes = [size for name, size in storage.file_sizes(found.folder).items() if name.endswith(".safetensors")]
-    assert (len(sizes), sum(sizes)) == (EPISODES, found.bytes)
+    sizes = [size for name, size in storage.file_sizes(result.folder).items() if name.endswith(".safetensors")]
+    assert (len(sizes), sum(sizes)) == (EPISODES, result.bytes)
 
 
 @pytest.mark.usefixtures("bucket")
@@ -109,8 +109,8 @@ def test_run_on_a_bucket_cache_equals_run_on_a_local_cache_bit_for_bit(
     bucket_config: Callable[..., Config], tmp_path: Path, encoded_frames: list[int]
 ) -> None:
     runs = []
-    for name, place in (("here", str(tmp_path / "caches")), ("there", URL)):
-        options = {"data__cache_dtype": "int8", "data__cache": "auto", "data__cache_dir": place, "training__steps": 3}
+    for name, folder in (("local", str(tmp_path / "caches")), ("bucket", URL)):
+        options = {"data__cache_dtype": "int8", "data__cache": "auto", "data__cache_dir": folder, "training__steps": 3}
         config = bucket_config(name, run_dir=str(tmp_path / f"run {name}"), **options)
         runs.append(train(config, SilentReporter()))
     assert_same_run(*runs)
@@ -123,26 +123,26 @@ def test_bucket_cache_needs_one_listing_and_reads_each_range_once(
     options = {"data__start_every": 2, "data__frames": 8}
     folder = encode_config(bucket_config(**options)).folder
     bucket_config = partial(bucket_config, **options)
-    expected = batches(opened(bucket_config("two")))
+    expected = batches(open_cached(bucket_config("two")))
     bucket.forget()
     dataset = open_cache_only(bucket_config("three"), folder)
-    asked = [request.target for request in bucket.requests]
-    assert len([one for one in asked if one.startswith("GET /storage/v1/b/bucket/o?")]) == 1
-    assert not [one for one in asked if ".safetensors" in one], "nothing of any episode"
-    assert equal(batches(dataset), expected)
-    clip = expected[0][0].nbytes
-    assert bucket.bytes_read(".safetensors") <= CLIPS * clip + EPISODES * SMALL
-    assert clip in [one.sent for one in bucket.reads(".safetensors")], "neighbouring frames come together"
+    targets = [request.target for request in bucket.requests]
+    assert len([target for target in targets if target.startswith("GET /storage/v1/b/bucket/o?")]) == 1
+    assert not [target for target in targets if ".safetensors" in target], "opening reads no episode"
+    assert are_equal(batches(dataset), expected)
+    clip_bytes = expected[0][0].nbytes
+    assert bucket.bytes_read(".safetensors") <= CLIPS * clip_bytes + EPISODES * HEADER_BYTES
+    assert clip_bytes in [read.sent for read in bucket.reads(".safetensors")], "neighbouring frames need one request"
     bucket.forget()
-    assert equal(batches(open_cache_only(bucket_config("three"), folder)), expected)
-    assert not bucket.reads(".safetensors"), "all from this machine's disk"
+    assert are_equal(batches(open_cache_only(bucket_config("three"), folder)), expected)
+    assert not bucket.reads(".safetensors"), "all latents are in the disk cache"
 
 
 # ---- failures ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("url", "status", "words"),
+    ("url", "status", "message"),
     [
         ("gs://nowhere/caches", None, "bucket nowhere does not exist"),
         (URL, 403, r"no permission.*gcloud auth application-default login"),
@@ -153,14 +153,14 @@ def test_unwritable_cache_url_raises_before_encoding(
     bucket_config: Callable[..., Config],
     url: str,
     status: int | None,
-    words: str,
+    message: str,
     encoded_frames: list[int],
 ) -> None:
     if status:
         bucket.fail_next(status, times=ALWAYS, match="POST /upload/")
-    for start in (encode_config, lambda config: set_up(config, SilentReporter())):
-        with pytest.raises(RefusedError, match=words):
-            start(bucket_config(data__cache_dir=url, data__cache="auto"))
+    for encode in (encode_config, lambda config: set_up(config, SilentReporter())):
+        with pytest.raises(RefusedError, match=message):
+            encode(bucket_config(data__cache_dir=url, data__cache="auto"))
     assert not encoded_frames
     assert bucket.names("bucket") == ["other"]
 
@@ -172,28 +172,27 @@ def test_damaged_bucket_file_is_reported_and_encoded_again(
     expected = batches(open_cache_only(bucket_config(), folder))
     for name in storage.file_sizes(folder):
         if name.endswith(".safetensors"):
-            place = storage.join(folder, name)
-            bucket.put(place.removeprefix("gs://"), storage.read_bytes(place)[:-10])
+            url = storage.join(folder, name)
+            bucket.put(url.removeprefix("gs://"), storage.read_bytes(url)[:-10])
     with pytest.raises(InputError, match=r"gs://.*safetensors: not a complete file of latents.*vjepa2-ac encode"):
         batches(open_cache_only(bucket_config(), folder))
     encoded_frames.clear()
     encode_config(bucket_config())
     assert sum(encoded_frames) == EPISODES * 24
-    assert equal(batches(open_cache_only(bucket_config(), folder)), expected)
+    assert are_equal(batches(open_cache_only(bucket_config(), folder)), expected)
 
 
 # ---- several and killed processes -------------------------------------------------------------------------------
 
 
-def start(nursery: Nursery, config: Config, folder: Path, name: str, **environment: str) -> object:
+def start_encoding(nursery: Nursery, config: Config, folder: Path) -> object:
     """Start `vjepa2-ac encode` in a separate process."""
-    path = folder / f"{name}.yaml"
+    path, out, err = folder / "config.yaml", folder / "out.txt", folder / "err.txt"
     path.write_text(as_yaml(config))
-    words = ("-m", "vjepa2_ac.cli", "encode", str(path))
-    files = [str(folder / f"{name}.{stream}") for stream in ("out", "err")]
-    for file in files:
-        Path(file).touch()
-    return nursery.start_script(*words, environment=dict(os.environ) | environment, out=files[0], err=files[1])
+    out.touch()
+    err.touch()
+    command = ("-m", "vjepa2_ac.cli", "encode", str(path))
+    return nursery.start_script(*command, environment=dict(os.environ), out=str(out), err=str(err))
 
 
 def test_killed_upload_leaves_no_finished_file(
@@ -204,7 +203,7 @@ def test_killed_upload_leaves_no_finished_file(
     )
     encoded_frames.clear()
     bucket.fail_next("hang", times=ALWAYS, match=r"POST /upload/.*00000[3-7]-")
-    child = start(nursery, bucket_config("two"), tmp_path, "killed")
+    child = start_encoding(nursery, bucket_config("two"), tmp_path)
     while bucket.faults_left == ALWAYS or len(latents_in(bucket)) < 3:  # during the fourth upload
         assert child.is_running()
         time.sleep(0.01)
@@ -213,9 +212,9 @@ def test_killed_upload_leaves_no_finished_file(
     folder = f"gs://bucket/{os.path.commonpath([name for name in bucket.names('bucket') if 'caches/' in name])}"
     with pytest.raises(InputError, match="no latents of 5 of 8 episodes"):
         open_cache_only(bucket_config("three"), folder)
-    found = encode_config(bucket_config("three"))
+    result = encode_config(bucket_config("three"))
     assert sum(encoded_frames) == 5 * 24
-    assert equal(batches(open_cache_only(bucket_config("three"), found.folder)), expected)
+    assert are_equal(batches(open_cache_only(bucket_config("three"), result.folder)), expected)
     assert not [
         name for name in bucket.names("bucket") if not name.endswith((".safetensors", ".json", ".npz", "other"))
     ]

@@ -1,4 +1,4 @@
-"""The encoding pipeline: each episode gets its own frames, an unreadable one does not affect others."""
+"""The encoding pipeline: each frame is read once, and an unreachable source is not a broken episode."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -28,16 +28,17 @@ def colours(inputs: torch.Tensor, chunk: int) -> torch.Tensor:
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """Encode every step of a source."""
+    """Return a function that encodes every step of a source."""
 
     def encode(source: MemorySource) -> LatentFiles:
         monkeypatch.setattr(dataset, "open_source", lambda _: source)
         config = DataConfig(path="memory", crop="letterbox", workers=2, broken_episodes="skip", cache_dtype="int8")
-        wanted = [FramesToEncode(n, "left", np.arange(steps, dtype=np.int32)) for n, steps in enumerate(source.lengths)]
+        steps = [np.arange(length, dtype=np.int32) for length in source.lengths]
+        requests = [FramesToEncode(index, "left", steps[index]) for index in range(len(steps))]
         model = SimpleNamespace(image_size=5, encode=colours)
         encoder = EncoderOnDevice(model, torch.device("cpu"), nullcontext, chunk=7)  # type: ignore[arg-type]
         files = LatentFiles(tmp_path, "key")
-        encode_files(dataset.open_dataset(config), wanted, encoder, files)
+        encode_files(dataset.open_dataset(config), requests, encoder, files)
         return files
 
     return encode
@@ -46,15 +47,15 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 def test_pipeline_reads_each_frame_of_each_episode_once(run: Run) -> None:
     source = MemorySource(LENGTHS)
     files = run(source)
-    assert sorted(source.decoded) == [(number, step) for number, steps in enumerate(LENGTHS) for step in range(steps)]
+    assert sorted(source.decoded) == [(index, step) for index, length in enumerate(LENGTHS) for step in range(length)]
     assert sorted(index for index, _, _ in source.reads) == [0, 1, 2]
-    for number, steps in enumerate(LENGTHS):
-        file = files.open(number, "left")
-        assert file.frame_steps.tolist() == list(range(steps))
-        pixels = unpack_latents(file.read_latents(range(steps)))[:, 0] * 255 * torch.tensor([0.229, 0.224, 0.225])
-        found = (pixels + 255 * torch.tensor([0.485, 0.456, 0.406])).numpy()
-        expected = np.stack([np.full(steps, number), np.arange(steps)], axis=1)
-        np.testing.assert_allclose(found[:, :2], expected, atol=0.6)
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    for index, length in enumerate(LENGTHS):
+        file = files.open(index, "left")
+        assert file.frame_steps.tolist() == list(range(length))
+        pixels = 255 * (unpack_latents(file.read_latents(range(length)))[:, 0] * std + mean)
+        expected = np.stack([np.full(length, index), np.arange(length)], axis=1)
+        np.testing.assert_allclose(pixels[:, :2].numpy(), expected, atol=0.6)
 
 
 def test_network_failure_does_not_mark_an_episode_broken(run: Run, tmp_path: Path) -> None:

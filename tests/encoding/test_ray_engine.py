@@ -1,4 +1,4 @@
-"""Encoding with Ray: same files and errors as with one process, also if actors die."""
+"""Encoding with Ray gives the same files and errors as encoding in one process, also if actors die."""
 
 import os
 import re
@@ -28,8 +28,9 @@ needs_ray = pytest.mark.skipif(
     find_spec("ray") is None, reason='Ray is not tested: pip install -c constraints.txt -e ".[cluster]"'
 )
 
-# A plug-in of the config, which actors import, too: after two files the encoder waits for the file `go`, or fails.
-ACCIDENT = """
+# A plug-in, which actors import, too. After two files the encoder waits for the file `go`. If the file `fail` exists,
+# the encoder raises an error.
+PLUGIN = """
 import time
 from pathlib import Path
 from vjepa2_ac.errors import InputError
@@ -37,44 +38,41 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.registry import TRACKERS
 
 TRACKERS.register("unused")(object)  # a plug-in registers something
-here, encode = Path(__file__).parent, WorldModel.encode
+folder, original_encode = Path(__file__).parent, WorldModel.encode
 
-def waiting(*given, **named):
-    while len(list(here.rglob("*.safetensors"))) >= 2 and not (here / "go").exists():
+def encode(*args, **kwargs):
+    while len(list(folder.rglob("*.safetensors"))) >= 2 and not (folder / "go").exists():
         time.sleep(0.02)
-    if (here / "fail").exists():
+    if (folder / "fail").exists():
         raise InputError(where="a frame", found="it is damaged")
-    return encode(*given, **named)
+    return original_encode(*args, **kwargs)
 
-WorldModel.encode = waiting
+WorldModel.encode = encode
 """
 
 
 @pytest.fixture
 def start(make_config: MakeConfig, tmp_path: Path, popen: Popen) -> Callable[[str], "subprocess.Popen[str]"]:
-    """Starts the command with an engine on 8 episodes; it stops after two."""
-    (tmp_path / "accident.py").write_text(ACCIDENT)
+    """Return a function that starts the command with an engine for 8 episodes; the encoder waits after two files."""
+    (tmp_path / "waiting_plugin.py").write_text(PLUGIN)
     (tmp_path / "config.yaml").write_text(
-        as_yaml(make_config(data__start_every=2)).replace("plugins: []", "plugins: [accident]")
+        as_yaml(make_config(data__start_every=2)).replace("plugins: []", "plugins: [waiting_plugin]")
     )
     path = os.pathsep.join([str(tmp_path), *sys.path])
 
-    def starting(engine: str) -> "subprocess.Popen[str]":
+    def start_command(engine: str) -> "subprocess.Popen[str]":
         return popen(
             [sys.executable, "-m", "vjepa2_ac.cli", "encode", "config.yaml", "--out", "out", "--engine", engine],
             cwd=tmp_path, env={**os.environ, "PYTHONPATH": path}, start_new_session=True, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
 
-    return starting
+    return start_command
 
 
-def two_files(folder: Path) -> Callable[[], bool]:
-    return lambda: len(list(folder.rglob("*.safetensors"))) >= 2
-
-
-def actors(process: psutil.Process) -> list[psutil.Process]:
-    return [one for one in process.children(recursive=True) if one.cmdline()[:1] and "MapWorker" in one.cmdline()[0]]
+def find_actors(process: psutil.Process) -> list[psutil.Process]:
+    children = process.children(recursive=True)
+    return [child for child in children if child.cmdline()[:1] and "MapWorker" in child.cmdline()[0]]
 
 
 def assert_finished(job: "subprocess.Popen[str]", folder: Path, config: MakeConfig) -> None:
@@ -91,25 +89,25 @@ def test_interrupted_ray_command_cleans_up_and_killed_actor_loses_no_file(
     start: Callable, make_config: MakeConfig, tmp_path: Path
 ) -> None:
     job = start("ray")
-    wait_until(two_files(tmp_path), [job])
-    started = psutil.Process(job.pid).children(recursive=True)
-    assert len(started) > 2
+    wait_until(lambda: len(list(tmp_path.rglob("*.safetensors"))) >= 2, [job])
+    children = psutil.Process(job.pid).children(recursive=True)
+    assert len(children) > 2
     os.killpg(job.pid, signal.SIGINT)  # Ctrl-C
     _, errors = job.communicate(timeout=60)
     assert job.returncode == 130
     assert "Traceback" not in errors
-    assert not psutil.wait_procs(started, timeout=60)[1]
+    assert not psutil.wait_procs(children, timeout=60)[1]
     job = start("ray")
-    wait_until(lambda: actors(psutil.Process(job.pid)), [job])
-    actors(psutil.Process(job.pid))[0].kill()
+    wait_until(lambda: find_actors(psutil.Process(job.pid)), [job])
+    find_actors(psutil.Process(job.pid))[0].kill()
     (tmp_path / "go").touch()
     assert_finished(job, tmp_path, make_config)
 
 
 @needs_ray
 def test_actor_error_equals_the_single_process_error(start: Callable, tmp_path: Path) -> None:
-    for word in ("go", "fail"):
-        (tmp_path / word).touch()
+    for name in ("go", "fail"):
+        (tmp_path / name).touch()
     job = start("ray")
     output, errors = job.communicate(timeout=120)
     assert job.returncode == 2, output + errors

@@ -1,4 +1,4 @@
-"""Training on cached latents equals training from frames: bit for bit in fp32, within rounding otherwise."""
+"""Training on cached fp32 latents equals training on frames bit for bit."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.training.loop import train
 
 
-def encoded(config: Config) -> Path:
+def encode(config: Config) -> Path:
     """Encode the data set of a config and return the folder of the cache."""
     dataset = open_dataset(config.data)
     return encode_for(config, load_base(config.model, seed=config.seed), dataset)
@@ -30,18 +30,18 @@ def test_training_on_a_lossless_cache_equals_on_the_fly_encoding_bit_for_bit(mak
     changes |= {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches")}
     on_the_fly = make_config(run_dir=str(tmp_path / "fly"), **changes)
     train(on_the_fly, reporter)
-    folder = encoded(on_the_fly)
+    folder = encode(on_the_fly)
     train(make_config(run_dir=str(tmp_path / "cached"), **(changes | cache_config(folder))), reporter)
     assert_same_run(tmp_path / "fly", tmp_path / "cached")
-    train(make_config(run_dir=str(tmp_path / "through"), **(changes | {"data__cache": "require"})), reporter)
-    assert_same_run(tmp_path / "fly", tmp_path / "through")
+    train(make_config(run_dir=str(tmp_path / "required"), **(changes | {"data__cache": "require"})), reporter)
+    assert_same_run(tmp_path / "fly", tmp_path / "required")
 
 
 def test_run_on_frames_resumes_on_a_cache(make_config, reporter, tmp_path, whole_run) -> None:
     changes = {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches")}
-    encoded(make_config(**changes))
+    encode(make_config(**changes))
     with pytest.raises(KilledError):
-        train(make_config(run_dir=str(tmp_path / "broken"), **changes), dying_reporter(type(reporter)(), 3))
-    cached = make_config(run_dir=str(tmp_path / "broken"), **(changes | {"data__cache": "require"}))
+        train(make_config(run_dir=str(tmp_path / "killed"), **changes), dying_reporter(type(reporter)(), 3))
+    cached = make_config(run_dir=str(tmp_path / "killed"), **(changes | {"data__cache": "require"}))
     train(cached, reporter, allow_config_change=True)
-    assert_same_run(whole_run, tmp_path / "broken")
+    assert_same_run(whole_run, tmp_path / "killed")

@@ -29,7 +29,7 @@ def encode_batch(
 ) -> LatentBatch:
     """Encode the frames of a batch on the device, each frame independently.
 
-    A batch from a latent cache is not encoded again: `require_same_encoder` has compared the encoders.
+    A batch from a latent cache already contains latents; `require_same_encoder` checks that their encoder is the same.
 
     Args:
         world_model: The model whose frozen encoder is used.
@@ -46,7 +46,7 @@ def encode_batch(
     elif batch.frames is not None:
         latents = world_model.encode(pixels_to_input(batch.frames, world_model.image_size), chunk=chunk)
     else:
-        raise ValueError("a batch with neither frames nor latents")
+        raise ValueError("a batch without frames and latents")
     return LatentBatch(
         latents=latents,
         states=batch.states,
@@ -74,7 +74,7 @@ def encode_frames(
         world_model: The model whose frozen encoder is used.
         frames: RGB, uncropped, of any size.
         crop: The kind of crop before encoding.
-        chunk: Frames per encoder call, and the number of frames that are on the device as pixels at once.
+        chunk: Frames per encoder call; only the pixels of these frames are on the device at once.
         views: Number of cameras side by side in each frame.
 
     Raises:
@@ -91,15 +91,15 @@ def encode_frames(
 
 
 def get_encoding(world_model: WorldModel, config: Config) -> Encoding:
-    """Return the settings that determine a model's latents: they are part of the key of a latent cache.
+    """Return the settings that determine a model's latents. They are part of the key of a latent cache.
 
-    This function hashes the encoder's weights, which takes time.
+    This function is slow, because it hashes the encoder's weights.
     """
     parts = {
         "encoder": world_model.encoder_fingerprint(),
         "image_size": world_model.image_size,
         "patch_size": world_model.sizes.patch_size,
-        "normalisation": 1,  # version; increase it if `transforms.pixels_to_input` or the feature normalisation changes
+        "normalisation": 1,  # version of `transforms.pixels_to_input` and `normalise_latents`
         "model.dtype": config.model.dtype,
         "training.precision": config.training.precision,
         **world_model.encoder_properties,
@@ -111,7 +111,7 @@ def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Conf
     """Refuse a latent cache from another encoder, image size or precision; data sets of frames are accepted.
 
     Raises:
-        InputError: Lists the differences.
+        InputError: The settings of the cache differ; the message lists the differences.
     """
     if isinstance(dataset.source, LatentSource):  # the weights are hashed only for caches
         differing = dataset.source.key.list_encoding_differences(get_encoding(world_model, config))
@@ -120,7 +120,7 @@ def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Conf
 
 
 def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> None:
-    """Refuse data whose states or actions do not have the width that the model expects.
+    """Refuse data whose states or actions do not have the widths that the model expects.
 
     Args:
         world_model: The model.
@@ -141,7 +141,7 @@ def get_extrinsics(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "ba
     """Return the camera poses of a batch if the model needs them, otherwise None.
 
     Raises:
-        InputError: The model needs camera poses and a clip has none; names the episodes of the batch.
+        InputError: The model needs camera poses and a clip has none; the message names the episodes of the batch.
     """
     if not world_model.sizes.predictor.use_extrinsics:
         return None

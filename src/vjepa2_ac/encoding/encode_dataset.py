@@ -1,7 +1,7 @@
-"""Encode a whole data set into a latent cache, by the command `encode` or at the start of a run.
+"""Encode a whole data set into a latent cache, with the command `encode` or at the start of a training run.
 
-The processes of the command do not communicate: each encodes its share of the episodes and writes one file per finished
-episode. The processes of a training run wait for each other.
+Several processes of the command do not communicate: each process encodes its share of the episodes and writes one file
+per episode and camera. The processes of a training run wait for each other.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from vjepa2_ac.storage import free_bytes
 Engine = Callable[[Config, LatentCache, Sequence[FramesToEncode], Reporter], None]  # encodes the missing frames
 
 _POLL_S = 1.0  # interval between checks for the files of other processes
-_VISIBILITY_TIMEOUT_S = 60.0  # a new file in a network folder becomes visible to other machines within this time
+_VISIBILITY_TIMEOUT_S = 60.0  # longer than a network folder needs to show a new file to other machines
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class EncodingResult:
     encoded: int  # number of episodes encoded for all cameras
     frames: int  # number of encoded frames of all cameras
     bytes: int
-    broken: Mapping[str, str]  # reasons of the episodes that could not be read, by identity
+    broken: Mapping[str, str]  # reason of each episode that could not be read, by identity
     is_finished: bool  # False while other processes are still encoding
 
 
@@ -54,16 +54,16 @@ def encode_config(
 ) -> EncodingResult:
     """Encode all frames that the clips of a config need, or this process's share of them, into a latent cache.
 
-    Episodes that could not be read before are tried again.
+    Episodes that could not be read in an earlier call are tried again.
 
     Args:
-        config: The data, the model whose encoder is used, device and precision.
+        config: The config of data, model, device and precision.
         reporter: Receives messages, and the progress of indexing and encoding.
-        out: The folder of the cache; None: the one of `data.cache`.
+        out: The folder of the cache; None: the folder that `data.cache_dir` determines.
         engine: Encodes the missing frames; None: this process encodes them on its device.
 
     Raises:
-        InputError: Some input cannot be used, or the disk space is too small.
+        InputError: An input cannot be used, or the disk has too little space.
     """
     require_encodable(config)
     device = select_device(config.training) if engine is None else torch.device("cpu")
@@ -81,15 +81,15 @@ def encode_config(
         )
     table, broken, files = cache.dataset.table, cache.broken, cache.files
     sizes = [(request, files.get_file_size(request.episode, request.camera)) for request in cache.requests]
-    absent = {request.episode for request, size in sizes if not size}
+    incomplete = {request.episode for request, size in sizes if not size}
     return EncodingResult(
         folder=cache.folder,
         episodes=len(table),
-        encoded=len({request.episode for request in cache.requests} - absent),
+        encoded=len({request.episode for request in cache.requests} - incomplete),
         frames=sum(len(request.steps) for request, size in sizes if size),
         bytes=sum(size for _, size in sizes),
         broken={table.identity(number): reason for number, reason in broken.items()},
-        is_finished=absent <= broken.keys(),
+        is_finished=incomplete <= broken.keys(),
     )
 
 
@@ -99,7 +99,7 @@ def open_cache(
     """Open the data set of a config and its latent cache, finished or not, and load the model whose encoder is used.
 
     Raises:
-        InputError: The folder holds another cache.
+        InputError: The folder contains another cache.
     """
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     reporter.task(LOADING)
@@ -153,10 +153,10 @@ def encode_share(
     share: ProcessShare,
     reporter: Reporter,
 ) -> None:
-    """Begin the cache and encode the share of one process: every n-th episode for n processes.
+    """Create the cache and encode the share of one process: every n-th episode for n processes.
 
     Raises:
-        InputError: As `begin_encoding` and `encode_files`; or the processes together found too many broken episodes.
+        InputError: As in `begin_encoding` and `encode_files`; or all processes together found too many broken episodes.
     """
     dataset = cache.dataset
     begin_encoding(cache, missing, reporter)
@@ -183,9 +183,9 @@ def use_latent_cache(
         config: The config of the run.
         dataset: The open data set, at its stride.
         model: The model whose encoder is used.
-        accelerator: Its processes share the encoding.
+        accelerator: The processes of the run, which share the encoding.
         reporter: Receives messages for the user.
-        check_only: Only report how much would be encoded, and return clips of frames.
+        check_only: Only report how many frames would be encoded; the result may then have clips of frames.
 
     Raises:
         InputError: The cache is from another encoder, is required and missing, or cannot be written.
@@ -214,7 +214,7 @@ def use_finished_cache(config: Config, dataset: Dataset, model: WorldModel) -> D
     """Return a data set with clips from a finished latent cache of this encoder, or unchanged if there is none.
 
     Raises:
-        InputError: The data set is itself a latent cache, from another encoder.
+        InputError: The data set is itself a latent cache, but from another encoder.
     """
     cache = _find_cache(config, dataset, model)
     return dataset if cache is None or cache.missing() else cache.open_dataset()
@@ -259,7 +259,7 @@ def require_shared(cache: LatentCache, is_visible: Callable[[], bool]) -> None:
     end = time.monotonic() + _VISIBILITY_TIMEOUT_S
     while not is_visible():
         if time.monotonic() > end:
-            problem = "files of one process of the run are not visible to another process"
+            problem = "files from one process of the run are not visible to another process"
             fix = "Choose a folder that all machines of the run share, or run `vjepa2-ac encode` once on every machine"
             raise InputError(where=f"data.cache_dir: {cache.folder}", found=problem, fix=fix)
         time.sleep(_POLL_S)

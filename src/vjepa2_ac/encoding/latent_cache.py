@@ -49,9 +49,9 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import free_bytes
 
 _GIGABYTE = 10**9
-FRAMES_AT_ONCE = 64  # decoded together: consecutive frames of a video, at most 180 MB at 720p
-_PREFETCHED_PARTS = 2  # per thread: one in progress and one ready
-_MAX_PENDING_WRITES = 2  # files at most, which limits the memory
+FRAMES_AT_ONCE = 64  # consecutive frames of an episode that are decoded together: at most 180 MB at 720p
+_PREFETCHED_PARTS = 2  # parts per thread: one in progress and one ready
+_MAX_PENDING_WRITES = 2  # files; a limit of the memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,28 +64,28 @@ class FramesToEncode:
 
 
 def needed_frames(dataset: Dataset) -> Iterator[FramesToEncode]:
-    """Yield the frames that clips of any split use, per episode and camera, in the data set's order.
+    """Yield the frames that clips of any split use, for each episode and camera, in the data set's order.
 
-    Episodes without clips are not included: those that are shorter than a clip, excluded or completely idle.
+    Episodes without clips are not included: they are shorter than a clip, excluded or completely idle.
     """
     starts, config = dataset.starts, dataset.config
-    within = np.arange(config.frames) * config.model_stride
+    offsets = np.arange(config.frames) * config.model_stride
     order = np.argsort(starts.episode, kind="stable")
-    for runs in np.split(order, np.flatnonzero(np.diff(starts.episode[order])) + 1):
-        if not len(runs):
+    for rows in np.split(order, np.flatnonzero(np.diff(starts.episode[order])) + 1):
+        if not len(rows):
             return  # a data set without clips
-        first = np.concatenate([starts.steps_of(int(run)) for run in runs])
-        steps = np.unique(first[:, None] + within).astype(np.int32)
+        first_steps = np.concatenate([starts.steps_of(int(row)) for row in rows])
+        steps = np.unique(first_steps[:, None] + offsets).astype(np.int32)
         for camera in config.cameras:
-            yield FramesToEncode(int(starts.episode[runs[0]]), camera, steps)
+            yield FramesToEncode(int(starts.episode[rows[0]]), camera, steps)
 
 
 @dataclass(frozen=True, eq=False)
 class LatentCache:
     """The latent cache of an open data set, finished or not. Several processes may write into its folder.
 
-    The cache is finished when no file is missing. After a kill, a deleted file or a new episode no repair is needed:
-    the next encoding writes the missing files.
+    The cache is finished when no file is missing. It needs no repair after a process was killed, a file was deleted or
+    an episode was added: the next encoding writes the missing files.
     """
 
     dataset: Dataset
@@ -95,12 +95,12 @@ class LatentCache:
 
     @classmethod
     def for_dataset(cls, dataset: Dataset, encoding: Encoding, folder: Path | str | None = None) -> LatentCache:
-        """Return the cache of a data set and an encoder.
+        """Return the cache for a data set and an encoder.
 
         Args:
-            dataset: A data set of frames, not itself a cache.
-            encoding: The settings by which frames become latents.
-            folder: The folder of the cache; None: a folder in `data.cache_dir`, or in the machine's default cache.
+            dataset: A data set of frames, which is not itself a cache.
+            encoding: The settings that determine the latents of a frame.
+            folder: The folder of the cache; None: a folder in `data.cache_dir` or in the disk cache of this machine.
         """
         config = dataset.config
         key = build_cache_key(config, compute_fingerprint(dataset.table), encoding)
@@ -110,20 +110,20 @@ class LatentCache:
 
     @property
     def files(self) -> LatentFiles:
-        """The files of the cache; behind a URL each access lists the folder again."""
+        """The files of the cache. With a URL each access of this property lists the folder again."""
         cache = open_download_cache(self.dataset.config.disk_cache) if storage.is_url(self.folder) else None
         return LatentFiles(self.folder, self.key.digest, cache)
 
     @cached_property
     def requests(self) -> tuple[FramesToEncode, ...]:
-        """The frames of the finished cache."""
+        """The frames that the finished cache contains."""
         return tuple(needed_frames(self.dataset))
 
     def missing(self, *, retry: bool = False) -> list[FramesToEncode]:
-        """Return the frames whose file is missing; with `retry` also those of unreadable episodes.
+        """Return the frames whose file is missing; with `retry`, also the frames of unreadable episodes.
 
-        The header of each local file is read, so that damaged files count as missing and are encoded again. Behind a
-        URL headers are read only with `retry`.
+        The header of each local file is read: a damaged file counts as missing and is encoded again. With a URL headers
+        are read only with `retry`.
         """
         if not self.is_begun:
             return list(self.requests)
@@ -141,9 +141,9 @@ class LatentCache:
 
     @property
     def broken(self) -> dict[int, str]:
-        """The reasons of the episodes that any process could not read, by the index of the episode."""
+        """The reason of each episode that a process could not read, by the index of the episode."""
         reasons, episodes = self.files.broken_reasons, {request.episode for request in self.requests}
-        return {number: reason for number, reason in reasons.items() if number in episodes}
+        return {episode: reason for episode, reason in reasons.items() if episode in episodes}
 
     @property
     def bytes_per_frame(self) -> int:
@@ -159,10 +159,10 @@ class LatentCache:
         return size if num_missing == frames else f"{size}; {frames - num_missing:,} cached, {num_missing:,} to encode"
 
     def require_same_key(self) -> None:
-        """Refuse a folder that holds another cache or other files.
+        """Refuse a folder that contains another cache or other files.
 
         Raises:
-            InputError: Lists how the other cache differs.
+            InputError: The folder contains another cache, and the message lists the differences; or other files.
         """
         require_matching_folder(self.folder, CACHE_FILE, self.key, where=f"latent cache {self.folder}")
 
@@ -170,7 +170,7 @@ class LatentCache:
         """Write the files that describe the cache, unless they exist.
 
         Raises:
-            InputError: The folder holds another cache or other files, or cannot be written.
+            InputError: The folder contains another cache or other files, or cannot be written.
             UnreachableError: The URL cannot be written.
         """
         self.require_same_key()
@@ -189,7 +189,7 @@ class LatentCache:
         """Refuse to start if the local disk has too little space for the missing frames; URLs are not checked.
 
         Raises:
-            InputError: Names the free space, the required space, and fixes.
+            InputError: The space is too small; the message has the free and the required space, and fixes.
         """
         if not isinstance(self.folder, Path):
             return
@@ -203,7 +203,7 @@ class LatentCache:
         """Return the same data set, with the same clips in the same order, read as latents from this cache.
 
         Raises:
-            InputError: The cache is not finished. If it was not started, the error names the most similar other cache.
+            InputError: The cache is not finished. If it does not exist, the message names the most similar other cache.
         """
         if self.is_begun:
             return open_cached_latents(self.dataset, self.folder)
@@ -223,12 +223,12 @@ class LatentCache:
 
 
 def count_frames(requests: Sequence[FramesToEncode]) -> int:
-    """Return the total number of frames of some requests."""
+    """Return the total number of frames of these requests."""
     return sum(len(request.steps) for request in requests)
 
 
 def image_bytes(image_size: int) -> int:
-    """Return the approximate size in bytes of a frame's JPEG image, including its share of the states."""
+    """Return the approximate size in bytes of a frame's JPEG image and the frame's states."""
     return 1000 + image_size**2 // 3
 
 
@@ -236,13 +236,13 @@ def require_space(folder: Path, frames: int, per_frame: int, *, fix: str) -> Non
     """Refuse to encode frames if the disk has too little space.
 
     Args:
-        folder: A folder on the disk; need not exist.
+        folder: A folder on the disk, which need not exist.
         frames: Number of frames.
         per_frame: Size of a frame in bytes.
         fix: The fix, for messages.
 
     Raises:
-        InputError: Names the free and the required space.
+        InputError: The space is too small; the message has the free and the required space.
     """
     needed, free = frames * per_frame, free_bytes(folder)
     if needed > free:
@@ -264,7 +264,7 @@ class EncoderOnDevice:
 
     @classmethod
     def from_model(cls, config: Config, model: WorldModel, device: torch.device) -> EncoderOnDevice:
-        """Move the encoder of a model, and only the encoder, to a device."""
+        """Move only the encoder of a model to a device, and return it with the settings of the config."""
         model.loaded_encoder.to(device)
         return cls(model, device, partial(autocast, config.training, device))
 
@@ -290,25 +290,25 @@ def encode_files(
 ) -> None:
     """Encode the requested frames and write one file per request.
 
-    An episode that cannot be read is recorded in the cache and treated as `data.broken_episodes` states. Files are
-    written atomically, so a kill loses only the files in progress.
+    An episode that cannot be read is recorded in the cache; `data.broken_episodes` determines whether it is skipped.
+    Files are written atomically, so a killed process loses only the files in progress.
 
     Args:
         dataset: Source of the frames.
-        requests: The requests.
+        requests: The frames to encode.
         encoder: Computes the latents.
         files: The files of the cache.
         progress: Called with (done, total) in frames.
         lossless_images: Store the encoder's input images without loss instead of as JPEGs.
 
     Raises:
-        InputError: An episode cannot be read and the policy does not skip it, too many episodes are broken, or a file
-            cannot be written. Files that were written before remain.
-        UnreachableError: A failure of the connection, not of the episode.
+        InputError: An episode cannot be read and is not skipped, too many episodes are broken, or a file cannot be
+            written. Files that were written before remain.
+        UnreachableError: The connection failed; the episode is not recorded as broken.
     """
     threads, writes = max(1, dataset.config.workers), deque[Future[None]]()
-    done, total = 0, count_frames(requests)
-    progress(done, total)
+    num_done, total = 0, count_frames(requests)
+    progress(num_done, total)
     writers = _MAX_PENDING_WRITES if storage.is_url(files.folder) else 1
     with ThreadPoolExecutor(threads, "decode") as decoders, ThreadPoolExecutor(writers, "write") as writer:
         parts_ahead = _read_ahead(decoders, dataset, requests, encoder, threads * _PREFETCHED_PARTS)
@@ -325,8 +325,8 @@ def encode_files(
                     )
                 while len(writes) > _MAX_PENDING_WRITES:
                     writes.popleft().result()
-                done += len(request.steps)
-                progress(done, total)
+                num_done += len(request.steps)
+                progress(num_done, total)
             for write in writes:
                 write.result()
         finally:
@@ -340,15 +340,18 @@ def _read_ahead(
     encoder: EncoderOnDevice,
     ahead: int,
 ) -> _Parts:
-    """Yield parts in the order of the requests, while threads read the next parts; each episode is opened once."""
-    frames = encoder.chunk * max(1, FRAMES_AT_ONCE // encoder.chunk)  # whole chunks, except at the end of an episode
+    """Yield parts in the order of the requests, while threads read up to `ahead` further parts.
+
+    Each episode is opened once.
+    """
+    part_size = encoder.chunk * max(1, FRAMES_AT_ONCE // encoder.chunk)  # frames: whole chunks, except in the last part
     queue = deque[tuple[FramesToEncode, Future[tuple[Episode, _Frames]]]]()
     for request in requests:
-        recording = pool.submit(dataset.read, request.episode, request.camera)
-        for first in range(0, len(request.steps), frames):
-            steps = request.steps[first : first + frames].tolist()
-            pinned = encoder.device.type == "cuda"
-            queue.append((request, pool.submit(_read_frames, dataset, recording, steps, pinned=pinned)))
+        episode = pool.submit(dataset.read, request.episode, request.camera)
+        for first in range(0, len(request.steps), part_size):
+            steps = request.steps[first : first + part_size].tolist()
+            is_pinned = encoder.device.type == "cuda"
+            queue.append((request, pool.submit(_read_frames, dataset, episode, steps, is_pinned=is_pinned)))
             if len(queue) > ahead:
                 yield queue.popleft()
     while queue:
@@ -356,11 +359,11 @@ def _read_ahead(
 
 
 def _read_frames(
-    dataset: Dataset, episode_future: Future[Episode], steps: Sequence[int], *, pinned: bool
+    dataset: Dataset, episode_future: Future[Episode], steps: Sequence[int], *, is_pinned: bool
 ) -> tuple[Episode, _Frames]:
-    recording = episode_future.result()
-    frames = torch.from_numpy(crop_frames(recording.read_frames(steps), dataset.config.crop))
-    return recording, frames.pin_memory() if pinned else frames
+    episode = episode_future.result()
+    frames = torch.from_numpy(crop_frames(episode.read_frames(steps), dataset.config.crop))
+    return episode, frames.pin_memory() if is_pinned else frames
 
 
 def _start_encoding(
@@ -369,7 +372,7 @@ def _start_encoding(
     """Start to encode an episode, and return a function that waits for the result."""
     latents, inputs_as_pixels = list[StoredLatents](), list[Tensor]()
     for _, part in parts:
-        recording, frames = part.result()
+        episode, frames = part.result()
         pixels = frames.to(encoder.device, non_blocking=True)
         inputs = pixels_to_input(pixels[None], encoder.world_model.image_size)[0]
         latents.append(pack_latents(encoder.latents(inputs), kind).map_tensors(_to_host))
@@ -379,15 +382,13 @@ def _start_encoding(
         if encoder.device.type == "cuda":
             torch.cuda.synchronize(encoder.device)
         images = np.ascontiguousarray(rearrange(torch.cat(inputs_as_pixels), "n c h w -> n h w c").numpy())
-        return EncodedEpisode(
-            recording, request.camera, request.steps.tolist(), join_latents(latents, torch.cat), images
-        )
+        return EncodedEpisode(episode, request.camera, request.steps.tolist(), join_latents(latents, torch.cat), images)
 
     return finish
 
 
 def _to_host(tensor: Tensor) -> Tensor:
-    """Return a copy in host memory; a copy from a GPU is asynchronous, so that the next part need not wait."""
+    """Return a copy in host memory. A copy from a GPU is asynchronous, so the next part can start before it ends."""
     if not tensor.is_cuda:
         return tensor.cpu()
     return torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True)

@@ -1,4 +1,4 @@
-"""Encoding on a cluster: Ray Data distributes the missing episodes to actors and retries those of a lost actor."""
+"""Encoding on a cluster: Ray Data distributes the missing episodes to actors and retries the tasks of a lost actor."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, FramesToEncode, Lat
 from vjepa2_ac.errors import InputError, UnreachableError, require_library
 from vjepa2_ac.reporter import Reporter
 
-_MAX_TASK_REQUESTS = 16  # requests per task at most; within a task decoding and encoding overlap
-_MIN_TASKS = 64  # with enough requests, so that all actors finish at about the same time
+_MAX_TASK_REQUESTS = 16  # requests per task; several requests let decoding and encoding overlap
+_MIN_TASKS = 64  # if there are enough requests; many tasks let all actors finish at about the same time
 _MAX_ACTOR_DEATHS = 10  # consecutive actors that die during start-up, as on nodes without this package
-_SHUTDOWN_TIMEOUT_S = 30.0  # wait for a thread of Ray Data at shutdown
+_SHUTDOWN_TIMEOUT_S = 30.0  # maximum wait for a thread of Ray Data at shutdown
 _RESUME_HINT = "Run the same command again to encode the missing frames"
 
 
 @contextlib.contextmanager
 def ray_engine(address: str) -> Iterator[Engine]:
-    """Connect to a Ray cluster, or start Ray on this machine, until the context ends; yield the engine.
+    """Yield an engine that encodes on a Ray cluster; Ray is shut down when the context ends.
 
     Args:
-        address: Address of the cluster, as for `ray.init`; empty: start Ray on this machine.
+        address: Address of the cluster, as for `ray.init`; empty: Ray is started on this machine.
 
     Raises:
         UnreachableError: Ray is not installed, or there is no cluster at the address.
@@ -68,11 +68,11 @@ def _encode(
 ) -> None:
     """Encode the missing frames with one actor per GPU, or per CPU core on a cluster without GPUs.
 
-    Actors may join later, and the episodes of an actor that dies are encoded by another one.
+    Actors may join later. If an actor dies, another actor encodes its episodes.
 
     Raises:
-        InputError: As `encode_share`, from any actor; or the config requests a GPU and there is none; or an actor has
-            other data, or cannot access the folder of the cache.
+        InputError: As in `encode_share`, from any actor; or the config requires a GPU and the cluster has none; or an
+            actor has other data, or cannot access the folder of the cache.
     """
     import ray
 
@@ -81,12 +81,12 @@ def _encode(
     if kind == "CPU" and config.training.device == "cuda":
         raise InputError(where=f"training.device: cuda, {where}", found="the cluster has no GPU")
     begin_encoding(cache, missing, reporter)
-    context, size = ray.data.DataContext.get_current(), max(1, min(_MAX_TASK_REQUESTS, len(missing) // _MIN_TASKS))
+    context, task_size = ray.data.DataContext.get_current(), max(1, min(_MAX_TASK_REQUESTS, len(missing) // _MIN_TASKS))
     context.enable_progress_bars = context.print_on_execution_start = False
     context.max_consecutive_actor_init_deaths = _MAX_ACTOR_DEATHS
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     folder = cache.folder.absolute() if isinstance(cache.folder, Path) else cache.folder
-    tasks = [{"task": _Task(missing[first : first + size])} for first in range(0, len(missing), size)]
+    tasks = [{"task": _Task(missing[first : first + task_size])} for first in range(0, len(missing), task_size)]
     results = ray.data.from_items(tasks, override_num_blocks=len(tasks)).map(
         _Actor,
         fn_constructor_args=(config_as_dict(config), folder, Path.cwd()),
@@ -94,16 +94,16 @@ def _encode(
         num_cpus=int(kind == "CPU"),
         num_gpus=int(kind == "GPU"),
     )
-    progress, done, total = reporter.task("encoding frames", "frames"), 0, count_frames(missing)
-    progress(done, total)
+    progress, num_encoded, total = reporter.task("encoding frames", "frames"), 0, count_frames(missing)
+    progress(num_encoded, total)
     for row in results.iter_rows():
         result: _Result = row["result"]
         if result.error is not None:
             raise result.error
         for name, reason in result.broken.items():
             cache.dataset.broken.record(name, reason)
-        done += result.frames
-        progress(done, total)
+        num_encoded += result.frames
+        progress(num_encoded, total)
     require_shared(cache, lambda: not cache.missing())
 
 
@@ -114,9 +114,9 @@ class _Task:
 
 @dataclass(frozen=True, eq=False)
 class _Result:
-    frames: int
-    broken: Mapping[str, str]  # reasons of all broken episodes that the actor has found, by identity
-    error: Exception | None = None  # returned, because Ray would wrap a raised error and may retry the task
+    frames: int  # number of frames of the task
+    broken: Mapping[str, str]  # reason of each broken episode that the actor has found so far, by identity
+    error: Exception | None = None  # not raised, because Ray would wrap it and might retry the task
 
 
 class _Actor:

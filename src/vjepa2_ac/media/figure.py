@@ -1,7 +1,7 @@
-"""Figures in one style, as PNG files, pixels and SVG for a page, and videos and image strips of predicted frames.
+"""Figures in a common style (PNG files, pixels, SVG), and image strips and videos of predicted frames.
 
-The colour around each image shows its kind: recorded, simulated, decoded from the latents of a true frame, or
-predicted by a model.
+The colour of the border around an image shows the kind of the image: recorded, simulated, decoded from the latents of a
+true frame, or predicted by a model.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from matplotlib.patches import Patch
 
 from vjepa2_ac.storage import atomic_writer
 
-# Characters that are invalid in a page or an image, or mislead a reader: control characters, lone surrogates,
+# Characters that are invalid in a page or an image, or could mislead a reader: control characters, lone surrogates,
 # noncharacters, and marks that change the direction of text.
 _HIDDEN = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff\\ufffe\\uffff]")
 GREY, BLUE, ORANGE, GREEN, RED = "#8a8a8a", "#1f6fb4", "#d1762a", "#2b8a3e", "#b3246b"
@@ -40,7 +40,7 @@ _STYLE = {
     "axes.titlelocation": "left",
     "axes.titlesize": 9,
     "legend.frameon": False,
-    "text.parse_math": False,  # names from the user are shown literally, also with dollar signs
+    "text.parse_math": False,  # dollar signs in names from the user are shown literally
 }
 
 
@@ -83,14 +83,20 @@ def figure_to_pixels(figure: Any) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def new_figure(width: float, height: float, **options: Any) -> Figure:
-    """Return a figure (size in inches) with a canvas, without pyplot, which keeps figures and may open windows."""
+    """Return a figure (size in inches) with a canvas.
+
+    Pyplot is not used, because it keeps all figures in memory and may open windows.
+    """
     figure = Figure(figsize=(width, height), **options)
     FigureCanvasAgg(figure)
     return figure
 
 
 def figure_to_svg(draw: Callable[..., None], width: float, height: float, *arguments: Any) -> str:
-    """Call `draw(figure, *arguments)` on a figure (size in inches) and return it as an SVG data: URL, reproducibly."""
+    """Call `draw(figure, *arguments)` on a figure (size in inches), and return it as a `data:` URL of SVG.
+
+    Equal figures give equal URLs.
+    """
     style = {"font.size": 9, "legend.fontsize": 8, "svg.fonttype": "none", "svg.hashsalt": "vjepa2-ac"}
     text = io.StringIO()
     with figure_style(style), warnings.catch_warnings():
@@ -123,10 +129,11 @@ FRAME_KINDS: dict[FrameKind, tuple[str, str]] = {
 
 _PREDICTED = {"predicted_base", "predicted"}
 _DPI = 100  # pixels per inch
-_LABEL, _SEQUENCE, _HEAD, _GAP, _LINE, _LEGEND = 160, 90, 90, 14, 17, 270  # pixels
-_MAX_COLUMNS = 6  # more are too small to read on a page that is 800 pixels wide
-_PREVIEW_S, _START_S, _END_S, _LOOP_S = 1.2, 0.8, 0.8, 6.0  # durations of parts of a loop, and its maximal duration
-_SLOWER = 2.0  # a loop plays at half the real speed
+_LABEL, _SEQUENCE, _HEAD, _GAP, _LINE, _LEGEND = 160, 90, 90, 14, 17, 270  # sizes of parts of a figure in pixels
+_MAX_COLUMNS = 6  # with more columns the images are too small on a page that is 800 pixels wide
+_PREVIEW_S, _START_S, _END_S = 1.2, 0.8, 0.8  # durations of the first image of a loop, the start and the end
+_MAX_LOOP_S = 6.0
+_SLOWDOWN = 2.0  # a loop plays at half the real speed
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +143,9 @@ class StripRow:
     label: str  # the source of the frames: the model, or the simulator
     kind: FrameKind  # kind of all frames; the first frame of a predicted row is the decoded start frame
     frames: UInt8[np.ndarray, "time height width 3"]
-    captions: tuple[str, ...] = ()  # one per frame, in small letters; empty: no captions
+    captions: tuple[str, ...] = ()  # one caption per frame, in small letters; empty: no captions
     sequence: str = ""  # name of the action sequence, if the strip has several
-    outlines: Bool[np.ndarray, "time height width"] | None = None  # mask of the true arm; None: unknown
+    outlines: Bool[np.ndarray, "time height width"] | None = None  # true mask of the arm, drawn as an outline
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,15 +164,15 @@ class RolloutStrip:
 
 
 def draw_strip(strip: RolloutStrip, *, side: int = 116) -> Pixels:
-    """Draw all rows below each other, with up to six evenly spread times from left to right; return the pixels.
+    """Draw the rows of a strip, with up to six evenly spaced times from left to right, and return the pixels.
 
     Args:
         strip: The rollouts.
         side: Approximate height and width of an image, in pixels.
     """
     columns = min(len(strip.seconds), _MAX_COLUMNS)
-    captioned = sum(bool(row.captions) for row in strip.rows)
-    size = _LABEL + columns * (side + _GAP), _HEAD + len(strip.rows) * (side + _GAP) + _LINE * captioned
+    num_captioned = sum(bool(row.captions) for row in strip.rows)
+    size = _LABEL + columns * (side + _GAP), _HEAD + len(strip.rows) * (side + _GAP) + _LINE * num_captioned
     kinds = {row.kind for row in strip.rows} | {"decoded" for row in strip.rows if row.kind in _PREDICTED}
     patches = [Patch(color=colour, label=text) for kind, (colour, text) in FRAME_KINDS.items() if kind in kinds]
     with _figure(strip, size) as figure:
@@ -196,7 +203,7 @@ def draw_rows(figure: Any, strip: RolloutStrip) -> None:
 
 
 def render_frames(strip: RolloutStrip, *, side: int = 172) -> Iterator[Pixels]:
-    """Yield a video frame for each time: a grid of models and action sequences, whose longer side is horizontal.
+    """Yield a video frame for each time: a grid of models and action sequences, the longer list horizontally.
 
     Args:
         strip: The rollouts.
@@ -227,18 +234,18 @@ def render_frames(strip: RolloutStrip, *, side: int = 172) -> Iterator[Pixels]:
 def schedule_loop(strip: RolloutStrip) -> list[tuple[int, float]]:
     """Return (frame index, duration in seconds) of each frame of an endless loop.
 
-    The last frame comes first, because previews show the first frame of a loop. Then all frames follow from the start,
-    at half the real speed, or faster where the loop would be longer than 6 s.
+    The last frame is shown first, because previews show the first frame of a loop. Then all frames follow from the
+    start, at half the real speed, or faster if the loop would be longer than 6 s.
     """
     last = len(strip.seconds) - 1
-    longest_s = (_LOOP_S - _PREVIEW_S - _START_S - _END_S) / max(last - 1, 1)
-    steps = [min(_SLOWER * step, longest_s) for step in np.diff(strip.seconds).tolist()]
-    return [(last, _PREVIEW_S), (0, _START_S), *zip(range(1, last), steps, strict=False), (last, _END_S)]
+    max_step_s = (_MAX_LOOP_S - _PREVIEW_S - _START_S - _END_S) / max(last - 1, 1)
+    durations = [min(_SLOWDOWN * step_s, max_step_s) for step_s in np.diff(strip.seconds).tolist()]
+    return [(last, _PREVIEW_S), (0, _START_S), *zip(range(1, last), durations, strict=False), (last, _END_S)]
 
 
 @contextmanager
 def _figure(strip: RolloutStrip, size: tuple[int, int]) -> Iterator[Any]:
-    """Yield a figure of (width, height) in pixels with the title of the rollouts."""
+    """Yield a figure with a size of (width, height) in pixels and with the title of the strip."""
     with figure_style({"font.size": 9}):
         figure = new_figure(*(pixels / _DPI for pixels in size), dpi=_DPI, layout="compressed", facecolor="white")
         figure.suptitle(strip.title, fontsize=11, weight="bold", x=0.01, ha="left")
@@ -270,8 +277,7 @@ def colour_errors(
     return np.asarray(colours[rows][:, columns])
 
 
-_CAPTION = 30  # pixels
-_BETWEEN = 6
+_CAPTION, _BETWEEN = 30, 6  # height of a caption and width of the gap between images, in pixels
 
 
 def stack_horizontally(

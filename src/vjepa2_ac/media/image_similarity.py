@@ -1,8 +1,8 @@
 """Pixel-wise image similarity: PSNR, SSIM and MS-SSIM of whole images or of the moving region.
 
-Images are RGB in 0 .. 1 (data range 1), channels first. All functions return one value per image, compute in float32
-without autocast, and are differentiable. All these metrics reward blur: an object smeared over all its possible
-positions scores better than a sharp object at a position 12 pixels off. Report them together with the spread of the
+Images are RGB in 0 .. 1 (data range 1), channels first. The metrics return one value per image, are computed in float32
+without autocast, and are differentiable. All these metrics reward blur: an object that is blurred over all its possible
+positions scores better than a sharp object that is 12 pixels off. Report the metrics together with the spread of the
 predictions, and for the moving region.
 """
 
@@ -22,8 +22,8 @@ PerImage = Float[Tensor, "*batch"]  # one number per image
 Channels = Float[Tensor, "*batch channel height width"]
 
 MOVING_THRESHOLD = 8 / 255  # a pixel moves if any channel changes by more than this
-DILATION_PX = 8  # pixels on each side
-_SIGMA, _RADIUS = 1.5, 5  # of the Gaussian window, 11 x 11
+DILATION_PX = 8  # dilation of the moving region on each side, in pixels
+_SIGMA, _RADIUS = 1.5, 5  # standard deviation and radius of the Gaussian window (11 x 11 pixels)
 _C1, _C2 = 0.01**2, 0.03**2  # the constants of luminance and contrast for a data range of 1
 _SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 _ROUNDING = 1e-5  # excludes a difference of exactly 8 levels of 255 despite rounding to float32
@@ -37,7 +37,7 @@ def psnr(predicted: Images, true: Images, mask: Mask | None = None) -> PerImage:
     Args:
         predicted: Images in 0 .. 1.
         true: Images in 0 .. 1.
-        mask: Mask of the pixels to average over; None: all. The result is NaN for an image without such pixels.
+        mask: The pixels to average over; None: all pixels. The result is NaN for an image with an empty mask.
     """
     squared = (predicted.float() - true.float()).square().mean(dim=-3)
     return -10 * torch.log10(masked_mean(squared, mask))
@@ -54,7 +54,7 @@ def ssim_map(predicted: Images, true: Images) -> Pixels:
     Average it over a region with `masked_mean`.
 
     Raises:
-        ValueError: A side of the images has fewer than 6 pixels, too few to reflect them at the borders.
+        ValueError: A side of the images has fewer than 6 pixels, which is too small for the reflected borders.
 
     Source: Wang, Bovik, Sheikh, Simoncelli (2004), Image Quality Assessment, equation 13; borders are reflected as in
     torchmetrics 1.9.0, whose values agree to 1e-5.
@@ -65,14 +65,14 @@ def ssim_map(predicted: Images, true: Images) -> Pixels:
 def ms_ssim(predicted: Images, true: Images, scales: int) -> PerImage:
     """Return the multi-scale structural similarity of each image, for a loss.
 
-    The result is a product over scales of the mean contrast (at the coarsest scale: the mean similarity), clamped to at
-    least 0 and raised to a weight. The weights are the first `scales` of the paper's five, divided by their sum. If a
-    factor is 0, the gradient of the product is 0: add a pixel loss.
+    The result is a product over scales. Each factor is the mean contrast (at the coarsest scale the mean similarity),
+    clamped to at least 0 and raised to a weight. The weights are the first `scales` weights of the paper, divided by
+    their sum. If a factor is 0, the gradient of the product is 0, so the loss needs another term.
 
     Args:
         predicted: Images in 0 .. 1, at least 11 pixels high and wide at the coarsest scale.
         true: Images in 0 .. 1 of the same shape.
-        scales: 1 to 5; each halves the image.
+        scales: Number of scales, 1 to 5; each further scale halves the image.
 
     Source: Wang, Simoncelli, Bovik (2003), Multiscale structural similarity, equation 7.
     """
@@ -125,8 +125,8 @@ def _compute_terms(predicted: Channels, true: Channels) -> tuple[Channels, Chann
 def _make_window_matrix(side: int, device: torch.device) -> Float[Tensor, "side side"]:
     """Return the matrix that smooths a line of pixels with the Gaussian window, reflected at both ends.
 
-    A matrix product is computed in full float32, whereas a convolution may use TF32, which is too coarse for the
-    variances. On a CPU it is also twenty times faster than a convolution of one channel.
+    A matrix product is computed in full float32, but a convolution may use TF32, which is too inaccurate for the
+    variances. On a CPU the matrix product is also twenty times faster than a convolution of one channel.
     """
     if side <= _RADIUS:
         raise ValueError(f"an image side of {side} px; the window needs more than {_RADIUS}")
@@ -147,6 +147,6 @@ def _halve(images: Channels) -> Float[Tensor, "*batch channel rows columns"]:
 
 
 def _power(factor: PerImage, weight: float) -> PerImage:
-    """Return `factor ** weight` for positive factors and 0 for others, with finite gradients; NaN stays NaN."""
-    positive = ~(factor <= 0)
-    return torch.where(positive, torch.where(positive, factor, 1) ** weight, 0)
+    """Return `factor ** weight` for positive factors and 0 for other factors, with finite gradients; NaN stays NaN."""
+    is_positive = ~(factor <= 0)
+    return torch.where(is_positive, torch.where(is_positive, factor, 1) ** weight, 0)

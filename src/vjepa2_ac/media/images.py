@@ -22,19 +22,19 @@ from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.spaces import StateSpace, rotation_angles
 from vjepa2_ac.storage import read_small_file, translate_read_errors
 
-MAX_PIXELS = 100_000_000  # ten times a robot's camera; the header of a 600-byte file may claim forty times as many
+MAX_PIXELS = 100_000_000  # ten times the pixels of a robot's camera; the header of a tiny file may claim 4 billion
 _MAX_BYTES = 1 << 32  # limit for images that are decoded together
 _MAX_FILE_BYTES = 1 << 28  # an uncompressed PNG of the largest allowed image has 300 MB
-_MIN_SIDE = 16  # least height and width of an image of a robot's scene, in pixels
+_MIN_SIDE = 16  # minimum height and width of an image of a robot's scene, in pixels
 
 
 def require_decodable_size(height: int, width: int, where: str, *, count: int = 1) -> None:
-    """Refuse images that are too large, or too many of that size to be decoded together, before memory is allocated.
+    """Refuse images that are too large, alone or together, before memory is allocated for decoding.
 
     Args:
         height: Height of each image in pixels.
         width: Width of each image in pixels.
-        where: The file, and its episode and step, for messages.
+        where: The file, episode and step, for messages.
         count: Number of images that are decoded together.
 
     Raises:
@@ -82,16 +82,16 @@ def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
 def decode_images(
     images: Sequence[bytes], steps: Sequence[int], where: str
 ) -> UInt8[np.ndarray, "time height width 3"]:
-    """Decode PNG or JPEG images to RGB; JPEG is bit for bit equal to TensorFlow's decoder.
+    """Decode PNG or JPEG images to RGB. The pixels of a JPEG are bit-exactly those of TensorFlow's decoder.
 
     Args:
-        images: Encoded images of one size; none give an empty array. The format is detected from the content.
+        images: Encoded images of one size. The format is detected from the content. Without images the result is empty.
         steps: Control step of each image, for messages.
         where: File, episode and camera, for messages.
 
     Raises:
-        InputError: An image is neither PNG nor JPEG, has more than 8 bits a channel, is too large, or has another size
-            than the first.
+        InputError: An image is neither PNG nor JPEG, has more than 8 bits per channel, is too large, or differs in size
+            from the first image.
     """
     decode = decode_image if images and images[0].startswith(_PNG) else _decode_as_tensorflow
     decoded = (decode(image, f"{where}: step {step}") for image, step in zip(images, steps, strict=True))
@@ -109,15 +109,15 @@ def _decode_as_tensorflow(image: bytes, where: str) -> UInt8[np.ndarray, "height
 def stack_frames(
     frames: Iterable[UInt8[np.ndarray, "height width 3"]], steps: Sequence[int], where: str
 ) -> UInt8[np.ndarray, "time height width 3"]:
-    """Stack frames from an iterator that decodes them one after another.
+    """Stack frames from an iterator, which may decode them on demand, and check their size.
 
     Args:
-        frames: Frames of one size; none give an empty array.
+        frames: Frames of one size. Without frames the result is empty.
         steps: Control step of each frame, for messages.
         where: File, episode and camera, for messages.
 
     Raises:
-        InputError: A frame has another size than the first, or the frames are too large together.
+        InputError: A frame differs in size from the first frame, or the frames are too large together.
     """
     stacked: list[UInt8[np.ndarray, "height width 3"]] = []
     for frame, step in zip(frames, steps, strict=True):
@@ -139,7 +139,7 @@ def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95
 
 _PNG = b"\x89PNG"
 _EXIF = b"Exif\0\0"  # header of the EXIF data in a JPEG
-_EIGHT_BIT = {"1", "L", "LA", "P", "RGB", "RGBA"}  # Pillow's modes of at most 8 bits a channel
+_EIGHT_BIT = {"1", "L", "LA", "P", "RGB", "RGBA"}  # Pillow's modes with at most 8 bits per channel
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
@@ -164,7 +164,7 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
     try:
         if data.startswith(b"\xff\xd8"):
             pixels = _decode_jpeg(data, where)
-            if _EXIF not in data:  # robot cameras write no EXIF; this search takes a thousandth of the decoding time
+            if _EXIF not in data:  # a fast search, which avoids opening the images of robot cameras a second time
                 return pixels
             with JpegImageFile(io.BytesIO(data)) as image:  # reads the header only
                 return _apply_orientation(pixels, image)
@@ -189,9 +189,9 @@ def _apply_orientation(
     """Rotate and mirror pixels according to the EXIF orientation of an image; unreadable EXIF data are ignored."""
     with suppress(OSError, ValueError, SyntaxError, struct.error, LookupError):
         orientation = image.getexif()[ExifTags.Base.Orientation]
-        turned = Image.fromarray(pixels)
-        turned.getexif()[ExifTags.Base.Orientation] = orientation
-        return np.array(ImageOps.exif_transpose(turned))
+        unoriented = Image.fromarray(pixels)
+        unoriented.getexif()[ExifTags.Base.Orientation] = orientation
+        return np.array(ImageOps.exif_transpose(unoriented))
     return pixels
 
 
@@ -215,7 +215,7 @@ def encode_webp(
 
     Args:
         frames: The frames.
-        seconds: Duration of each frame.
+        seconds: Duration of each frame in seconds.
         quality: Quality of the compression, from 0 to 100.
     """
     file = io.BytesIO()
@@ -228,9 +228,9 @@ def encode_webp(
 # ---- checks of a camera ----
 
 _BLOCKS = 16  # blocks along each side of an image; averaging over a block removes sensor noise but not the scene
-_MIN_CONTRAST = 1.0  # of 255; a covered lens with noise of 10 is below, a scene at 5 % of its light is above
+_MIN_CONTRAST = 1.0  # of 255; a covered lens with noise of 10 is below, a scene at 5 % of its brightness is above
 _STILL_M, _STILL_RAD = 0.005, math.radians(3.0)  # larger than the noise of the measured states of a still arm
-_STILL_SHARE = 0.5  # the same threshold for vectors, as a share of the largest change in a model step
+_STILL_FRACTION = 0.5  # the threshold for vectors, as a fraction of the largest change in a model step
 
 CameraFrame = tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, " dim"]]
 """The newest frame of one camera, and the state that was measured when this frame appeared."""
@@ -242,7 +242,7 @@ def newest_frames(
     """Return the newest distinct frame of each camera: a repeated image keeps the state of its first appearance.
 
     Args:
-        views: The current image of each camera; copied, since a driver may reuse its memory for the next image.
+        views: The current image of each camera. It is copied, because a driver may reuse its memory for the next image.
         state: The measured state.
         previous: The previous result; empty after a reset.
     """
@@ -266,14 +266,14 @@ def has_moved(
     """
     (change,) = space.compute_differences(np.stack([earlier, later]))
     if not space.is_pose:
-        return bool(((max_change > 0) & (abs(change) > _STILL_SHARE * max_change)).any())
+        return bool(((max_change > 0) & (abs(change) > _STILL_FRACTION * max_change)).any())
     return float(np.linalg.norm(change[:3])) > _STILL_M or float(rotation_angles(change[None, 3:6])[0]) > _STILL_RAD
 
 
 def is_uniform(image: UInt8[np.ndarray, "height width 3"]) -> bool:
     """Return whether an image has no contrast, as from a black, covered or defective camera, with or without noise.
 
-    The criterion: the standard deviation of the means of 16 x 16 blocks is below 1 of 255 in each colour.
+    The criterion is that the standard deviation of the means of 16 x 16 blocks is below 1 of 255 in each colour.
     """
     blocks = Image.fromarray(np.ascontiguousarray(image)).resize((_BLOCKS, _BLOCKS), Image.Resampling.BOX)
     return bool(np.asarray(blocks, dtype=float).std(axis=(0, 1)).max() < _MIN_CONTRAST)

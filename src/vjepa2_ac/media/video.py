@@ -1,8 +1,8 @@
 """Read frames of an MP4 at requested positions or times, decoding only the necessary packets; write videos and GIFs.
 
-Frames are identified by their presentation time, never by counting at the frame rate in the header, because that rate
-is often wrong (as in DROID) and B-frames are stored in another order than they are shown. Frames are rotated and
-mirrored according to the display matrix of the file. Videos are written atomically.
+Frames are identified by their presentation time, not by the frame rate in the header, because this rate is often wrong
+(as in DROID) and B-frames are stored in another order than they are displayed. Frames are rotated and mirrored
+according to the display matrix of the file. Videos are written atomically.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _DECODER_OPTIONS = {
     "max_pixels": str(MAX_PIXELS),
 }
 _START = -(1 << 40)  # a time before all frames
-_SAME_RATE = 0.98  # least ratio of the video's rate to the steps' rate; times in ms round 30 Hz to 30.3 Hz
+_SAME_RATE = 0.98  # minimum ratio of the video's rate to the steps' rate; times in ms round 30 Hz to 30.3 Hz
 _FIX = "Copy the file again, or exclude the episode"
 _CRF = 20  # x264's constant rate factor: text stays sharp
 _PALETTE_SIZE = 255  # colours of a GIF
@@ -45,11 +45,11 @@ Frame = UInt8[np.ndarray, "height width 3"]
 
 @dataclass(frozen=True)
 class Clock:
-    """The times of an episode's steps in a video file of many episodes: step k is at start_s + k / rate_hz."""
+    """The times of an episode's steps in a video file, which may contain many episodes: start_s + step / rate_hz."""
 
     start_s: float
     rate_hz: float
-    source: str = "the clock"  # where the rate is stated, for messages
+    source: str = "the clock"  # the file that states the rate, for messages
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class VideoHeader:
     """The number and the rate of a video's frames, determined without decoding."""
 
     num_frames: int
-    span_s: float  # from the first frame to the last
-    rate_hz: float  # frames per second, by the median interval; 0 for a single frame
+    span_s: float  # time from the first frame to the last
+    rate_hz: float  # frames per second, from the median interval; 0 for a single frame
 
 
 def read_frames(
@@ -71,25 +71,25 @@ def read_frames(
 ) -> UInt8[np.ndarray, "time height width 3"]:
     """Return the RGB frames at the requested positions of a video, in the order of the request.
 
-    Decoding starts at the key frame before a requested frame; only requested frames are converted to RGB. With a
-    clock, the frame of a step is the one nearest to its time, at most 0.49 of a step away; if two are equally near, the
-    earlier one. The frame of a step does not depend on the other requested steps.
+    Decoding starts at the key frame before a requested frame, and only requested frames are converted to RGB. With a
+    clock, the frame of a step is the frame nearest to the time of the step, at most 0.49 steps away. If two frames are
+    equally near, the earlier frame is used. The frame of a step does not depend on the other requested steps.
 
     Args:
         file: Local path, URL, or a file open for reading, which stays open.
-        steps: Positions in display order, from 0; with a clock, the episode's steps. Positions may repeat.
-        where: The file and its episode, for messages.
+        steps: Positions in display order, counted from 0; with a clock, the episode's steps. They may repeat.
+        where: The file and episode, for messages.
         clock: The times of the steps, if positions do not identify the frames.
-        times: The result of `read_frame_times` for the file, which is slow for videos with B-frames (it reads every
-            packet); None: it is computed.
+        times: The result of `read_frame_times` for the file, if it is known. For videos with B-frames it is slow to
+            compute, because every packet is read.
 
     Raises:
-        InputError: The file is not a video, damaged, lacks requested frames, or has a codec that cannot be decoded.
+        InputError: The file is not a video, is damaged, lacks requested frames, or has a codec that cannot be decoded.
         OSError: A file behind a URL cannot be read.
         ValueError: There are no steps, or a step is negative.
     """
     if not steps or min(steps) < 0:
-        raise ValueError(f"{where}: steps {list(steps)}")
+        raise ValueError(f"{where}: steps {list(steps)}; expected one or more steps from 0")
     with _open_video(file, where) as video:
         if clock is not None:
             frame_times = _find_times_by_clock(video, clock, steps)
@@ -104,7 +104,7 @@ def read_frames(
 
 def _find_times_by_position(steps: Sequence[int], times: Sequence[int], where: str) -> list[int]:
     if max(steps) >= len(times):
-        raise _video_error(where, f"{len(times)} frames", f"at least {max(steps) + 1}")
+        raise _video_error(where, f"{len(times)} frames", f"at least {max(steps) + 1} frames")
     if len(set(times)) < len(times):
         raise _video_error(where, "several frames with the same presentation time", "a different time for each frame")
     return [times[step] for step in steps]
@@ -129,10 +129,10 @@ def _find_times_by_clock(video: _Video, clock: Clock, steps: Sequence[int]) -> l
 
 
 def read_header(file: str | Path | ByteReader, *, where: str) -> VideoHeader:
-    """Return number and rate of a video's frames, from its index, or from its packets if it has no index.
+    """Return the number and the rate of a video's frames, from its index, or from its packets if it has no index.
 
     Raises:
-        InputError: The file is not a video, or damaged.
+        InputError: The file is not a video, or is damaged.
         OSError: A file behind a URL cannot be read.
     """
     with _open_video(file, where) as video:
@@ -140,7 +140,7 @@ def read_header(file: str | Path | ByteReader, *, where: str) -> VideoHeader:
 
 
 def read_frame_times(file: str | Path | ByteReader, *, where: str) -> list[int]:
-    """Return the presentation time of each frame of a video, in the video's units; errors as `read_header`."""
+    """Return the presentation time of each frame of a video in the video's time units; errors as in `read_header`."""
     with _open_video(file, where) as video:
         return video.times()
 
@@ -162,7 +162,7 @@ def _open_video(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
         return
     source = _ErrorStoringFile(file)
     try:
-        # The demuxer is fixed, because libav would otherwise follow playlists to other files.
+        # The format is set, because libav would otherwise also open playlists, which refer to other files.
         with av.open(source, format="mp4", metadata_errors="replace") as container:
             yield _Video(container, _select_stream(container, where), av.video.reformatter.VideoReformatter(), where)
     except (av.FFmpegError, InputError) as error:
@@ -218,7 +218,7 @@ class _ErrorStoringFile:
 
 @dataclass(frozen=True)
 class _Video:
-    """An open video. Times are in units of the stream; its index holds decoding times, not presentation times."""
+    """An open video. Times are in units of the stream. Its index has decoding times, not presentation times."""
 
     container: Any
     stream: VideoStream
@@ -252,7 +252,7 @@ class _Video:
         yield from (packet for packet in self.container.demux(self.stream) if packet.dts is not None)
 
     def header(self) -> VideoHeader:
-        """Return number and rate of the frames; decoding times have the same intervals as presentation times."""
+        """Return the number and rate of the frames; decoding times have the same intervals as presentation times."""
         times = self.stored_times() if self.is_indexed else self.times()
         intervals = np.diff(times) * self.unit_s
         interval_s = float(np.median(intervals)) if len(intervals) else 0.0
@@ -261,12 +261,12 @@ class _Video:
     def nearest_times(self, targets: Sequence[int], tolerance: int) -> dict[int, int]:
         """Return the presentation time of the frame nearest to each of these ascending times, without decoding.
 
-        If two frames are equally near, the earlier one is used. Times without a frame within the tolerance are left
-        out.
+        If two frames are equally near, the earlier frame is used. The result does not contain times without a frame
+        within the tolerance.
         """
         times: list[int] = []
         for packet in self._packets_before(targets[0]):
-            if int(packet.dts or 0) > targets[-1] + tolerance:  # all frames that follow are shown later
+            if int(packet.dts or 0) > targets[-1] + tolerance:  # all following frames are displayed later
                 break
             if packet.pts is not None and not packet.is_discard:
                 times.append(int(packet.pts))
@@ -290,14 +290,14 @@ class _Video:
         sent: set[int] = set()
         delay: int | None = None
         for packet in self._packets_before(times[0]):
-            decoded = int(packet.dts or 0)
-            shown = decoded if packet.pts is None else int(packet.pts)
-            delay = shown - decoded if delay is None else delay  # all key frames of a file have the same delay
-            sent.add(shown)
+            dts = int(packet.dts or 0)
+            pts = dts if packet.pts is None else int(packet.pts)
+            delay = pts - dts if delay is None else delay  # all key frames of a file have the same delay
+            sent.add(pts)
             self._collect(decoder.decode(packet), times, frames)
             if times[0] in sent:
-                following = next((time for time in times if time not in sent), None)
-                if following is None or self._key_frame_before(following - delay) > decoded + int(packet.duration or 0):
+                missing = next((time for time in times if time not in sent), None)
+                if missing is None or self._key_frame_before(missing - delay) > dts + int(packet.duration or 0):
                     break
         self._collect(decoder.decode(None), times, frames)
 
@@ -332,7 +332,7 @@ class _Video:
 
 
 def _nearest(times: Sequence[int], target: int) -> int:
-    """Return the item of ascending times nearest to a target (the earlier of two equally near); `_START` if empty."""
+    """Return the one of ascending times that is nearest to a target (the earlier of two); `_START` if empty."""
     index = bisect_left(times, target)
     return min(times[max(0, index - 1) : index + 1], key=lambda time: abs(time - target), default=_START)
 
@@ -377,12 +377,12 @@ def write_video(
         frames: One or more frames of one size.
         rate_hz: Frames per second.
         crf: x264's constant rate factor; a lower value means higher quality.
-        key_frame_every: Interval between key frames, in frames; a small one makes random access fast. None: x264's
+        key_frame_every: Interval between key frames, in frames; a small interval makes random access fast. None: x264's
             default.
 
     Raises:
         UnreachableError: PyAV is not installed.
-        ValueError: There are no frames, or they differ in size.
+        ValueError: There are no frames, or the frames differ in size.
     """
     av = import_pyav()
     size: tuple[int, int] | None = None
@@ -408,12 +408,13 @@ def write_video(
 def write_gif(path: str | Path, frames: Sequence[Frame], *, seconds: Sequence[float]) -> Path:
     """Write RGB frames as an endless GIF and return its path.
 
-    Colours are reduced to 255 without dithering, which would flicker and make the file several times larger.
+    The number of colours is reduced to 255. Dithering is not used, because it would flicker and make the file several
+    times larger.
 
     Args:
         path: A local file; missing folders are created.
         frames: One or more frames of one size.
-        seconds: Duration of each frame; GIFs store hundredths of a second.
+        seconds: Duration of each frame in seconds; GIFs store hundredths of a second.
     """
     from PIL import Image
 
