@@ -123,7 +123,7 @@ def test_the_program_accepts_every_command_of_a_guide(page, monkeypatch: pytest.
             words = re.sub(r"^\s*(\.venv/bin/)?", "", command)
             if not words.startswith("vjepa2-ac ") or "…" in words or "$" in words:
                 continue
-            options = program.parsed(program._parser(), shlex.split(words)[1:])
+            options = program.parse_arguments(program._make_parser(), shlex.split(words)[1:])
             config = str(getattr(options, "config", None))
             if config.startswith(("builtin:", "configs/")):
                 load_config(config, getattr(options, "overrides", []))

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import vjepa2_ac
 from paths import ROOT
-from vjepa2_ac.cli.program import _parser
+from vjepa2_ac.cli.program import _make_parser
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import all_keys
 from vjepa2_ac.registry import REGISTRIES
@@ -27,7 +27,7 @@ def surface() -> str:
             f"{registry.group}: {', '.join(sorted(registry.names()))}".rstrip(": ") for registry in REGISTRIES
         ],
         "Top-level config keys": list(Config.model_fields),
-        "Commands": list(commands(_parser(), "vjepa2-ac")),
+        "Commands": list(commands(_make_parser(), "vjepa2-ac")),
     }
     return "\n\n".join("\n".join([title, *(f"  {line}" for line in lines)]) for title, lines in parts.items()) + "\n"
 

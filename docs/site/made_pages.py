@@ -12,7 +12,7 @@ from typing import Any
 
 import vjepa2_ac
 from site_links import ROOT, on_site
-from vjepa2_ac.cli.program import _parser
+from vjepa2_ac.cli.program import _make_parser
 from vjepa2_ac.config.loading import config_path, config_schema, packaged_configs
 
 _COLUMNS = "88"  # of a help text
@@ -79,7 +79,7 @@ def contents_page(title: str, pages: Mapping[str, str]) -> str:
 def commands_page() -> str:
     """Return a section for each command, with what `--help` prints."""
     os.environ["COLUMNS"] = _COLUMNS
-    leaves = {" ".join(words): parser for words, parser in _leaves(_parser(), ())}
+    leaves = {" ".join(words): parser for words, parser in _leaves(_make_parser(), ())}
     lines = ["# Every command", "", "As `vjepa2-ac COMMAND --help` prints them; [TAB completes](../start.md) them.", ""]
     lines += [f"- [{name}](#{name.replace(' ', '-')}): {_first_sentence(one)}" for name, one in leaves.items()]
     for name, parser in leaves.items():

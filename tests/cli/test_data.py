@@ -35,7 +35,7 @@ Printed = pytest.CaptureFixture[str]
 LEVELS = ("ok", "warning", "error", "skipped")
 
 
-def test_check_prints_a_line_for_everything_and_ends_with_0(config: str, capsys: Printed) -> None:
+def test_check_prints_one_line_per_finding_and_returns_0(config: str, capsys: Printed) -> None:
     assert main(["data", "check", config, "--limit", "4"]) == 0
     *lines, summary = capsys.readouterr().out.splitlines()
     findings = [line.split()[:2] for line in lines if line.startswith(LEVELS)]
@@ -43,7 +43,7 @@ def test_check_prints_a_line_for_everything_and_ends_with_0(config: str, capsys:
     assert {"train", "validation", "batch", "pixels", "position", "rotation", "gripper", "actions", "timing"} <= {
         about for _, about in findings
     }
-    counts = {level: sum(one == level for one, _ in findings) for level in LEVELS}
+    counts = {level: sum(printed_level == level for printed_level, _ in findings) for level in LEVELS}
     assert (
         summary == f"0 errors, {counts['warning']} warning{'s' * (counts['warning'] != 1)}, {counts['skipped']} skipped"
     )
@@ -55,13 +55,13 @@ def test_check_with_json_prints_one_object_with_the_same_findings(
 ) -> None:
     assert main(["data", "check", config, "--limit", "4", *words]) == 0
     text = capsys.readouterr().out
-    lines, words_of_all = [line for line in text.splitlines() if line.startswith(LEVELS)], " ".join(text.split())
+    lines, one_line = [line for line in text.splitlines() if line.startswith(LEVELS)], " ".join(text.split())
     assert main(["data", "check", config, "--limit", "4", "--json", *words]) == 0
     printed = json.loads(capsys.readouterr().out)
-    shown = [f"{one['level']} {one['name']} {one['text']}" for one in printed["findings"]]
-    assert len(shown) == len(lines)
-    assert not [line for line in shown if line not in words_of_all and " s" not in line], "only times differ"
-    levels = [one["level"] for one in printed["findings"]]
+    findings = [f"{finding['level']} {finding['name']} {finding['text']}" for finding in printed["findings"]]
+    assert len(findings) == len(lines)
+    assert not [text for text in findings if text not in one_line and " s" not in text], "only times differ"
+    levels = [finding["level"] for finding in printed["findings"]]
     assert [printed[name] for name in ("errors", "warnings", "skipped")] == [
         levels.count(level) for level in ("error", "warning", "skipped")
     ]
@@ -71,7 +71,7 @@ def test_check_with_json_prints_one_object_with_the_same_findings(
         assert {"value", "low", "high"} == printed["variants"][1]["difference"].keys()
 
 
-def test_check_with_json_keeps_stdout_empty_where_the_data_cannot_be_read(config: str, capsys: Printed) -> None:
+def test_check_with_json_prints_nothing_to_stdout_if_the_data_cannot_be_read(config: str, capsys: Printed) -> None:
     assert main(["data", "check", config, "--json", "data.camera=elsewhere"]) == 2
     assert capsys.readouterr().out == ""
     assert main(["data", "check", config, "--json", "--limit", "2", "data.validation_share=0"]) == 1
@@ -82,14 +82,12 @@ COMMANDS = ["data check", "data inspect", "data calibrate", "train", "encode", "
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_folder_in_place_of_a_config_is_answered_with_init(command: str, droid: Path, capsys: Printed) -> None:
+def test_folder_instead_of_a_config_raises_with_the_init_command(command: str, droid: Path, capsys: Printed) -> None:
     assert main([*command.split(), str(droid)]) == 2
     assert f"`vjepa2-ac init {droid}`" in capsys.readouterr().err
 
 
-def test_a_url_or_a_run_in_place_of_a_config_is_answered_with_what_to_name(
-    config: str, tmp_path: Path, capsys: Printed
-) -> None:
+def test_url_or_run_instead_of_a_config_raises_with_the_fix(config: str, tmp_path: Path, capsys: Printed) -> None:
     with pytest.raises(SystemExit):
         main(["data", "check", "gs://robots/set"])
     assert "`vjepa2-ac init gs://robots/set`" in capsys.readouterr().err
@@ -97,26 +95,26 @@ def test_a_url_or_a_run_in_place_of_a_config_is_answered_with_what_to_name(
     assert f"The config of the run in it is {config}" in capsys.readouterr().err
 
 
-def test_check_ends_with_1_where_training_could_not_begin(config: str, capsys: Printed) -> None:
+def test_check_returns_1_if_training_would_fail(config: str, capsys: Printed) -> None:
     assert main(["data", "check", config, "data.validation_share=0", "--limit", "2"]) == 1
     assert "error    validation" in capsys.readouterr().out
 
 
-def test_an_unwritable_folder_is_known_before_anything_is_read(config: str, tmp_path: Path, capsys: Printed) -> None:
+def test_unwritable_output_folder_raises_before_data_are_read(config: str, tmp_path: Path, capsys: Printed) -> None:
     (tmp_path / "file").write_text("")
     assert main(["data", "inspect", config, "--out", str(tmp_path / "file" / "in it")]) == 2
     assert "--out" in capsys.readouterr().err
 
 
-def test_inspect_prints_and_writes_statistics_and_a_figure(config: str, tmp_path: Path, capsys: Printed) -> None:
+def test_inspect_prints_and_writes_statistics_and_a_contact_sheet(config: str, tmp_path: Path, capsys: Printed) -> None:
     out = tmp_path / "out"
     words = ["data.stride=auto", "--out", str(out), "--limit", "4", "--rows", "1"]
     assert main(["data", "inspect", config, *words]) == 0
     printed = capsys.readouterr().out
-    for words in ("episodes", "idle", "wrist_left", "candidate, 4"):
-        assert words in printed
-    read = json.loads((out / "inspect.json").read_text())
-    assert (read["episodes"], read["sampled_episodes"]) == (8, 4)
+    for text in ("episodes", "idle", "wrist_left", "candidate, 4"):
+        assert text in printed
+    values = json.loads((out / "inspect.json").read_text())
+    assert (values["episodes"], values["sampled_episodes"]) == (8, 4)
     assert (out / "contact_sheet.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -140,26 +138,26 @@ def test_calibrate_prints_a_table_and_writes_its_metrics(config: str, tmp_path: 
     assert main(arguments) == 0
     printed = capsys.readouterr().out
     assert "Best stride" in printed
-    read = json.loads((out / "calibration.json").read_text())
-    assert [row["stride"] for row in read["strides"]] == [4, 8, 15]
-    assert read["stride"] in {4, 8, 15}
-    assert {row["clips"] for row in read["strides"]} == {4}
+    calibration = json.loads((out / "calibration.json").read_text())
+    assert [row["stride"] for row in calibration["strides"]] == [4, 8, 15]
+    assert calibration["stride"] in {4, 8, 15}
+    assert {row["clips"] for row in calibration["strides"]} == {4}
 
 
-def test_axes_are_fitted_written_and_drawn_and_a_model_that_knows_none_is_told(
+def test_axes_of_an_unknown_robot_are_written_but_unusable_for_planning(
     config: str, tmp_path: Path, capsys: Printed
 ) -> None:
-    """The synthetic robot is one that the model does not know: whatever is fitted, nothing can be planned by it."""
+    """The model was not trained on the synthetic robot, so no rotation of its axes is useful."""
     out = tmp_path / "out"
     arguments = ["data", "calibrate", config, "--axes", "builtin:sim-tiny", "--limit", "12", "--out", str(out)]
     assert main(arguments) == 1
     printed = capsys.readouterr().out
     assert "Not usable for planning: " in printed
-    read = json.loads((out / "axes.json").read_text())
-    assert read["pairs"] == 12
-    assert read["problem"] in " ".join(printed.split())
-    assert read["model"]["subject"] == "builtin:sim-tiny"
+    axes = json.loads((out / "axes.json").read_text())
+    assert axes["pairs"] == 12
+    assert axes["problem"] in " ".join(printed.split())
+    assert axes["model"]["subject"] == "builtin:sim-tiny"
     capsys.readouterr()
     assert main(["plan", "builtin:sim-tiny", f"planning.axes={out / 'axes.json'}", "--start", "a.png", "--goal",
                  "a.png", "--state", "0.4,0,.3,3,0,0,0"]) == 2  # fmt: skip
-    assert read["problem"][:12] in capsys.readouterr().err
+    assert axes["problem"][:12] in capsys.readouterr().err

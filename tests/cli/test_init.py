@@ -32,7 +32,7 @@ def test_init_writes_a_config_checks_the_data_and_prints_the_next_commands(
     assert main(["train", "my-robot.yaml", "--check"]) == 0
 
 
-def test_init_keeps_an_existing_config_without_overwrite(
+def test_init_replaces_an_existing_config_only_with_overwrite(
     working_directory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (working_directory / "mine.yaml").write_text("precious")

@@ -13,7 +13,7 @@ import torch
 
 from made_pages import _leaves
 from vjepa2_ac.cli import main, program, setup
-from vjepa2_ac.cli.options import parsed
+from vjepa2_ac.cli.options import parse_arguments
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.record import RecordingSpec
@@ -31,7 +31,7 @@ EVALUATE, SIMULATE = ["evaluate", "run"], ["simulate", "record", "folder"]
         (SIMULATE, "--seed", ["x", "-1", "2147483648"], "a whole number from 0 to 2147483647"),
     ],
 )
-def test_an_invalid_number_is_refused_with_the_valid_range(
+def test_invalid_number_raises_with_the_valid_range(
     command: list[str], option: str, wrong: list[str], needed: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for text in wrong:
@@ -40,29 +40,33 @@ def test_an_invalid_number_is_refused_with_the_valid_range(
         assert re.search(rf"error: argument {option}.*: {re.escape(repr(text))} is not {needed}$", last_line(capsys))
 
 
-COMMANDS = dict(_leaves(program._parser(), ()))  # by the words that lead to each
+COMMANDS = dict(_leaves(program._make_parser(), ()))  # by the words of each command
 
 
-def example(words: tuple[str, ...]) -> list[str]:
-    """Return what the help of a command says to type, without the program, and without what is the shell's."""
+def example_arguments(words: tuple[str, ...]) -> list[str]:
+    """Return the arguments in the example of a command's help, without redirections of the shell."""
     title, line = COMMANDS[words].format_help().splitlines()[:2]
     assert title == "example:"
     return shlex.split(line.partition(" > ")[0], comments=True)[1:]
 
 
-WITH_SETTINGS = [words for words in COMMANDS if hasattr(parsed(program._parser(), example(words)), "overrides")]
+WITH_OVERRIDES = [
+    words
+    for words in COMMANDS
+    if hasattr(parse_arguments(program._make_parser(), example_arguments(words)), "overrides")
+]
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_help_begins_with_an_example_that_is_right_and_fits_80_columns(words: tuple[str, ...], monkeypatch) -> None:
+def test_help_begins_with_a_valid_example_and_fits_80_columns(words: tuple[str, ...], monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    given = example(words)
-    assert given[: len(words)] == list(words)
-    assert parsed(program._parser(), given).handler
+    arguments = example_arguments(words)
+    assert arguments[: len(words)] == list(words)
+    assert parse_arguments(program._make_parser(), arguments).handler
     assert max(map(len, COMMANDS[words].format_help().splitlines())) <= 80
 
 
-def test_without_a_command_all_are_listed_in_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+def test_program_without_a_command_lists_all_commands_one_per_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert [main([]), main(["data"])] == [2, 2]
     printed = capsys.readouterr().out
     assert max(map(len, printed.splitlines())) <= 80
@@ -78,60 +82,66 @@ def test_without_a_command_all_are_listed_in_a_line_each(capsys: pytest.CaptureF
         ("simulate", RecordingSpec),
     ],
 )
-def test_the_help_says_the_defaults_of_the_records_that_options_fill(command: str, kind: type) -> None:
-    """An option that is not given is None: the record says what then counts."""
+def test_help_states_the_defaults_of_the_dataclasses_that_options_fill(command: str, kind: type) -> None:
+    """If such an option is omitted, its parsed value is None, and the dataclass defines the default."""
     helps = {action.dest: str(action.help) for action in COMMANDS[command,]._actions if action.default is None}
     defaults = {field.name: field.default for field in fields(kind) if field.name in helps}
-    told = {name: default for name, default in defaults.items() if default not in {None, MISSING, ()}}
-    assert len(told) > 1
-    for name, default in told.items():
+    documented = {name: default for name, default in defaults.items() if default not in {None, MISSING, ()}}
+    assert len(documented) > 1
+    for name, default in documented.items():
         assert re.search(rf"\({default}[;)]", helps[name]), name
 
 
-@pytest.mark.parametrize("words", WITH_SETTINGS, ids=" ".join)
-def test_settings_may_stand_anywhere_behind_what_they_are_of(words: tuple[str, ...]) -> None:
-    given, behind = example(words), len(words) + (2 if words in {("config",), ("export",), ("data", "convert")} else 1)
+@pytest.mark.parametrize("words", WITH_OVERRIDES, ids=" ".join)
+def test_overrides_are_accepted_at_any_position_after_the_positional_arguments(words: tuple[str, ...]) -> None:
+    arguments, start = (
+        example_arguments(words),
+        len(words) + (2 if words in {("config",), ("export",), ("data", "convert")} else 1),
+    )
     first, second = "planning.samples=64", "data.path=a=b"
-    for order in ([first, second, *given[behind:]], [first, *given[behind:], second], [*given[behind:], first, second]):
-        options = parsed(program._parser(), [*given[:behind], *order])
-        assert [one for one in options.overrides if one in {first, second}] == [first, second]
+    rest = arguments[start:]
+    for order in ([first, second, *rest], [first, *rest, second], [*rest, first, second]):
+        options = parse_arguments(program._make_parser(), [*arguments[:start], *order])
+        assert [override for override in options.overrides if override in {first, second}] == [first, second]
 
 
-@pytest.mark.parametrize("words", WITH_SETTINGS, ids=" ".join)
-def test_what_is_no_setting_is_refused(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("words", WITH_OVERRIDES, ids=" ".join)
+def test_unknown_option_after_an_override_raises(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
-        main([*example(words), "a.b=1", "--stepz", "3"])
+        main([*example_arguments(words), "a.b=1", "--stepz", "3"])
     assert f"vjepa2-ac {' '.join(words)}: error: unrecognized arguments: --stepz 3" in last_line(capsys)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
         (
             ["evaluate", "run", "--clips", "3", "planning.samples=64"],
             "planning.samples=64.*config keys cannot be changed",
         ),
-        (["evaluate", "run", "--clips", "3", "other"], "'other' is no key=value"),
+        (["evaluate", "run", "--clips", "3", "other"], "'other' is not key=value"),
         (["config", "schema", "training.steps=3"], "config schema training.steps=3"),
         (["plan", "run", "--start", "a", "--goal", "b", "--state", "1", "2", "-3"], r"'2 -3'.*in one word"),
         (["trian", "c.yaml"], "'trian' is unknown. Did you mean train[?]"),
         (["data", "chek", "c.yaml"], "Did you mean check[?]"),
         (["evaluate", "run", "--split", "tset"], "Did you mean test[?]"),
         (["demo", "--plugn", "x"], "unrecognized arguments: --plugn x. Did you mean --plugin[?]"),
-        (["qqq"], "'qqq' is unknown. Known are demo, init, "),
+        (["evaluate"], "arguments are required: RUN_OR_MODEL$"),
+        (["data", "calibrate", "c.yaml", "--frames", "3"], "All options: `vjepa2-ac data calibrate --help`"),
+        (["qqq"], "'qqq' is unknown. Choices: demo, init, "),
         (["simulate", "run", "--episodes", "3", "samples"], "'samples'"),
         (["simulate", "record", "out", "--stepz", "3"], "unrecognized arguments: --stepz 3"),
         (["data", "check", "c.yaml", "--limit", "3", "samples"], "'samples'"),
         (["train", "c.yaml", "samples"], "no such file"),
     ],
 )
-def test_a_word_that_does_nothing_is_refused(
-    arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+def test_invalid_command_line_raises_with_a_hint(
+    arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match="2"):
         sys.exit(main(arguments))
-    assert re.search(words, capsys.readouterr().err)
+    assert re.search(message, capsys.readouterr().err)
 
 
 def raising(error: BaseException) -> Callable[..., int]:
@@ -142,7 +152,7 @@ def raising(error: BaseException) -> Callable[..., int]:
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
+    ("error", "message"),
     [
         (
             OSError(errno.EMFILE, "Too many open files"),
@@ -157,21 +167,21 @@ def raising(error: BaseException) -> Callable[..., int]:
         (OSError(errno.ENOSPC, "No space left on device", "run"), r"No space left on device: 'run'"),
     ],
 )
-def test_what_the_system_does_not_give_is_one_line(
-    error: BaseException, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_lack_of_a_system_resource_prints_one_line(
+    error: BaseException, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(setup, "_config", raising(error))
     assert main(["config", "schema"]) == 2
-    assert re.search(words, capsys.readouterr().err)
+    assert re.search(message, capsys.readouterr().err)
 
 
-def test_a_mistake_of_ours_is_no_error_of_the_users(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(setup, "_config", raising(RuntimeError("a mistake")))
-    with pytest.raises(RuntimeError, match="a mistake"):
+def test_bug_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(setup, "_config", raising(RuntimeError("a bug")))
+    with pytest.raises(RuntimeError, match="a bug"):
         main(["config", "schema"])
 
 
-def test_a_missing_working_directory_is_reported(
+def test_missing_working_directory_raises(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "gone"

@@ -19,9 +19,9 @@ KEY = "correct-horse-battery-staple"
 
 
 @pytest.fixture(scope="module")
-def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a model, goal images and a key."""
-    folder = tmp_path_factory.mktemp("workshop")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a model, goal images and a key file."""
+    folder = tmp_path_factory.mktemp("folder")
     tiny_model().save_pretrained(folder / "model")
     (folder / "goals").mkdir()
     Image.fromarray(image(50)).save(folder / "goals/cup.png")
@@ -30,9 +30,9 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_serve_replies_to_a_robot_and_records_every_decision(workshop: Path, tmp_path: Path) -> None:
+def test_serve_replies_to_a_robot_and_records_every_decision(folder: Path, tmp_path: Path) -> None:
     record = tmp_path / "record"
-    arguments = [str(workshop / "model"), "--goals", str(workshop / "goals"), "--key-file", str(workshop / "key")]
+    arguments = [str(folder / "model"), "--goals", str(folder / "goals"), "--key-file", str(folder / "key")]
     process, url = start_server(*arguments, "--record", str(record), *QUICK)
     with pytest.raises(UnreachableError, match="401"):
         PlanningClient(url)
@@ -40,7 +40,7 @@ def test_serve_replies_to_a_robot_and_records_every_decision(workshop: Path, tmp
     with PlanningClient(url, KEY) as client:
         assert client.metadata["goals"] == ["cup"]
         assert client.metadata["limits"]["workspace"] is None
-        assert str(workshop) not in json.dumps({**client.metadata})
+        assert str(folder) not in json.dumps({**client.metadata})
         for step in range(3):
             message = {"observation/image": image(step), "observation/state": STATE + 0.01 * step, "prompt": "cup"}
             replies.append(client.infer(message))
@@ -49,9 +49,9 @@ def test_serve_replies_to_a_robot_and_records_every_decision(workshop: Path, tmp
     assert [line["answer"]["actions"] for line in lines] == [reply["actions"].tolist() for reply in replies]
 
 
-def test_dry_run_with_poses_replies_to_roboarena_messages(workshop: Path) -> None:
+def test_dry_run_with_poses_replies_to_roboarena_messages(folder: Path) -> None:
     arguments = ["--dry-run", "--actions", "pose", *QUICK, "data.stride=5"]
-    process, url = start_server(str(workshop / "model"), *arguments)
+    process, url = start_server(str(folder / "model"), *arguments)
     with PlanningClient(url) as client:
         assert client.metadata["action_space"] == "cartesian_position"
         reply = client.infer({
@@ -74,18 +74,18 @@ INVALID_OPTIONS = {
 
 @pytest.mark.parametrize("error", INVALID_OPTIONS)
 def test_invalid_option_raises_before_the_server_listens(
-    error: str, workshop: Path, tmp_path: Path, capsys, monkeypatch
+    error: str, folder: Path, tmp_path: Path, capsys, monkeypatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["serve", str(workshop / "model"), *INVALID_OPTIONS[error]]) == 2
-    found = capsys.readouterr()
-    assert error in found.err.replace("\n", " ")
-    assert "listening" not in found.out
+    assert main(["serve", str(folder / "model"), *INVALID_OPTIONS[error]]) == 2
+    printed = capsys.readouterr()
+    assert error in printed.err.replace("\n", " ")
+    assert "listening" not in printed.out
 
 
-def test_model_that_needs_extrinsics_raises(workshop: Path, capsys) -> None:
-    tiny_model(extrinsics=True).save_pretrained(workshop / "camera")
-    assert main(["serve", str(workshop / "camera"), "--port", "0"]) == 2
+def test_serving_a_model_that_needs_extrinsics_without_them_raises(folder: Path, capsys) -> None:
+    tiny_model(extrinsics=True).save_pretrained(folder / "camera")
+    assert main(["serve", str(folder / "camera"), "--port", "0"]) == 2
     assert "predictor.use_extrinsics" in capsys.readouterr().err
 
 

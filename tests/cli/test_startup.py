@@ -1,4 +1,4 @@
-"""Wrong words are told before PyTorch is imported, which takes seconds; its threads sleep soon."""
+"""Invalid arguments are reported before slow imports and loading; threads of PyTorch do not spin."""
 
 import os
 import subprocess
@@ -10,7 +10,7 @@ import pytest
 from paths import ROOT
 from vjepa2_ac.cli import main
 
-WRONG = """
+INVALID = """
 train nope.yaml
 train {demo} training.stepz=3
 train {demo}
@@ -21,6 +21,8 @@ encode {demo}
 evaluate nope
 evaluate builtin:sim-tiny
 evaluate nope --data {demo} --out out
+imagine nope --decoder builtin:sim-tiny
+imagine builtin:sim-tiny --decoder builtin:sim-tiny
 compare a b
 data check nope.yaml
 data check {demo}
@@ -69,17 +71,25 @@ for line in sys.argv[1].strip().splitlines():
         status = main(line.split())
     except SystemExit as end:
         status = end.code
-    found = {"torch", "transformers", "matplotlib", "mujoco"} & set(sys.modules)
-    if status != 2 or found:
-        sys.exit(f"{line}: status {status}, imported {found}")
+    imported = {"torch", "transformers", "matplotlib", "mujoco"} & set(sys.modules)
+    if status != 2 or imported:
+        sys.exit(f"{line}: status {status}, imported {imported}")
 """
 
 
-def test_wrong_words_are_told_before_pytorch_is_imported(tmp_path: Path) -> None:
-    words = WRONG.format(demo=ROOT / "configs" / "demo.yaml")
-    done = subprocess.run([sys.executable, "-c", CODE, words], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stderr.count("error: ") == len(words.strip().splitlines())
+def test_invalid_arguments_are_reported_before_pytorch_is_imported(tmp_path: Path) -> None:
+    lines = INVALID.format(demo=ROOT / "configs" / "demo.yaml")
+    process = subprocess.run([sys.executable, "-c", CODE, lines], cwd=tmp_path, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr[-2000:]
+    assert process.stderr.count("error: ") == len(lines.strip().splitlines())
+
+
+def test_unknown_action_is_reported_before_a_decoder_or_model_is_loaded(
+    whole_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("vjepa2_ac.evaluation.imagined.load_decoder", lambda *_: pytest.fail("too late"))
+    assert main(["imagine", str(whole_run), "--decoder", "builtin:sim-tiny", "--actions", "true,sideways"]) == 2
+    assert "'sideways'. Expected true" in capsys.readouterr().err
 
 
 def test_published_checkpoints_are_listed_without_pytorch() -> None:
@@ -88,28 +98,28 @@ import sys
 from vjepa2_ac.cli import main
 sys.exit(main(["download", "--list"]) or len({"torch", "transformers", "matplotlib", "mujoco"} & set(sys.modules)))
 """
-    done = subprocess.run([sys.executable, "-c", listing], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert "vjepa2.1-vitG-2b-384" in done.stdout
+    process = subprocess.run([sys.executable, "-c", listing], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr[-2000:]
+    assert "vjepa2.1-vitG-2b-384" in process.stdout
 
 
-def test_threads_of_pytorch_sleep_soon_where_they_have_nothing_to_do_unless_the_user_says_otherwise() -> None:
+def test_openmp_spin_count_is_set_unless_the_user_sets_it() -> None:
     command_line = "from vjepa2_ac.cli import main; main(['config', 'list']); "
     program = command_line + "import torch; torch.ones(64, 64) @ torch.ones(64, 64)"
-    for given, expected in (({}, "1000"), ({"GOMP_SPINCOUNT": "7"}, "7")):
+    for variables, expected in (({}, "1000"), ({"GOMP_SPINCOUNT": "7"}, "7")):
         environment = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
-        environment |= {"OMP_DISPLAY_ENV": "verbose", **given}  # libgomp says what it has read
+        environment |= {"OMP_DISPLAY_ENV": "verbose", **variables}  # libgomp then prints its settings
         command = [sys.executable, "-c", program]
-        said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stderr
-        assert f"GOMP_SPINCOUNT = '{expected}'" in said
+        printed = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stderr
+        assert f"GOMP_SPINCOUNT = '{expected}'" in printed
 
 
-def test_a_bug_report_names_this_machine_and_no_secret_or_path(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_bug_report_describes_the_machine_without_secrets_and_paths(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setenv("HF_TOKEN", "hidden")
     monkeypatch.setenv("VJEPA2_AC_CACHE", "/home/hidden/cache")
     assert main(["doctor"]) == 0
     printed = capsys.readouterr().out
-    for told in ("vjepa2-ac 0.", f"Python {sys.version.split()[0]}", "torch 2.", "peft 0.", "CPU: ", "GPU: ", "CUDA"):
-        assert told in printed
+    for text in ("vjepa2-ac 0.", f"Python {sys.version.split()[0]}", "torch 2.", "peft 0.", "CPU: ", "GPU: ", "CUDA"):
+        assert text in printed
     assert "VJEPA2_AC_CACHE=(a path)" in printed
     assert not [word for word in ("hidden", str(Path.home()), str(ROOT)) if word in printed]

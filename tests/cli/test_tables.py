@@ -1,4 +1,4 @@
-"""Every number of a table is readable, on narrow and wide terminals, whatever the length of a cell."""
+"""Console tables show every number and word in full, in narrow and wide terminals and with long cells."""
 
 import re
 from collections.abc import Callable
@@ -42,8 +42,8 @@ def evaluations() -> list[Table]:
     ]
     evaluated_models += [EvaluatedModel(name, "other", Copier()) for name in names[2:]]
     probes = ProbeOptions(ranking_clips=4, samples=4, landscape_clips=2, nodes=3, examples=0)
-    found = evaluate(cast("Any", evaluated_models), again(clips_batch(12, 0)), about(), probes=probes)
-    return row_tables(make_rows(found), "Held-out episodes")
+    evaluation = evaluate(cast("Any", evaluated_models), again(clips_batch(12, 0)), about(), probes=probes)
+    return row_tables(make_rows(evaluation), "Held-out episodes")
 
 
 def comparisons() -> list[Table]:
@@ -55,14 +55,14 @@ def comparisons() -> list[Table]:
 
 def plans() -> list[Table]:
     actions, states = np.full((3, 7), -0.12345), np.full((4, 7), -0.54321)
-    answers = [
+    results = [
         Mock(
             spec=PlanResult, actions=actions, states=states, decision=Mock(why="planned"), state_space=space,
             space=Mock(free=torch.arange(7)),
         )
         for space in (POSE, make_vector_states(7))
     ]  # fmt: skip
-    return [plan_table(answer) for answer in answers]
+    return [plan_table(result) for result in results]
 
 
 def benchmarks() -> list[Table]:
@@ -82,9 +82,9 @@ def benchmarks() -> list[Table]:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-@pytest.mark.parametrize("made", [variants, evaluations, comparisons, plans, benchmarks])
-def test_no_figure_and_no_word_is_cut_off(made: Callable[[], list[Table]], width: int) -> None:
-    for table in made():
+@pytest.mark.parametrize("make_tables", [variants, evaluations, comparisons, plans, benchmarks])
+def test_tables_show_all_numbers_and_words_in_full(make_tables: Callable[[], list[Table]], width: int) -> None:
+    for table in make_tables():
         console = PlainConsole(width=width)
         with console.capture() as capture:
             console.print(table)

@@ -31,13 +31,13 @@ def settings(goal: SubGoal) -> tuple:
 
 
 def test_goals_survive_write_and_read(folder: Path) -> None:
-    found = read_goal_folder(folder)
-    assert [settings(goal) for goal in found] == [settings(goal) for goal in GOALS]
-    for goal, written in zip(found, GOALS, strict=True):
-        np.testing.assert_array_equal(goal.image, written.image)
-    written = json.loads((folder / GOALS_FILE).read_text())
-    assert written["origin"] == {"by": "me"}
-    assert [goal["frame"] for goal in written["goals"]] == [8, 12, 30]
+    goals = read_goal_folder(folder)
+    assert [settings(goal) for goal in goals] == [settings(goal) for goal in GOALS]
+    for goal, original in zip(goals, GOALS, strict=True):
+        np.testing.assert_array_equal(goal.image, original.image)
+    content = json.loads((folder / GOALS_FILE).read_text())
+    assert content["origin"] == {"by": "me"}
+    assert [goal["frame"] for goal in content["goals"]] == [8, 12, 30]
     assert sorted(path.name for path in folder.iterdir()) == ["goal_1.png", "goal_2.png", "goal_3.png", GOALS_FILE]
 
 
@@ -48,11 +48,11 @@ def test_fields_of_older_versions_are_ignored(folder: Path) -> None:
     assert len(read_goal_folder(folder)) == 3
 
 
-def test_hand_written_folder_needs_only_files(tmp_path: Path) -> None:
+def test_hand_written_folder_needs_only_the_file_names_of_goals(tmp_path: Path) -> None:
     for name in ("grasped.png", "placed.png"):
         (tmp_path / name).write_bytes(encode_png(image(1)))
-    written = {"format": 1, "goals": [{"file": "grasped.png", "at_most": 4, "at_least": 4}, {"file": "placed.png"}]}
-    (tmp_path / GOALS_FILE).write_text(json.dumps(written))
+    content = {"format": 1, "goals": [{"file": "grasped.png", "at_most": 4, "at_least": 4}, {"file": "placed.png"}]}
+    (tmp_path / GOALS_FILE).write_text(json.dumps(content))
     first, last = read_goal_folder(tmp_path)
     assert settings(first) == ("", 4, 4, None, None)
     assert settings(last) == ("", 1, None, None, None)
@@ -78,7 +78,7 @@ def first(**changes: object) -> Any:
         (lambda goals: goals.append(3), r"goals\.3"),
     ],
 )  # fmt: skip
-def test_invalid_goal_raises_with_its_name(change: Any, wrong: str, folder: Path) -> None:
+def test_invalid_goal_raises_with_the_wrong_key(change: Any, wrong: str, folder: Path) -> None:
     edit(folder, change)
     with pytest.raises(InputError, match=wrong):
         read_goal_folder(folder)
@@ -100,7 +100,7 @@ def test_invalid_or_differently_sized_images_raise(folder: Path) -> None:
         read_goal_folder(folder)
 
 
-def test_folder_without_goals_raises_with_the_command(tmp_path: Path) -> None:
+def test_folder_without_goals_raises_with_the_goals_command(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"goals\.json: cannot be read.*`vjepa2-ac goals` writes"):
         read_goal_folder(tmp_path)
     with pytest.raises(ValueError, match="no goals"):

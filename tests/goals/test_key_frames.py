@@ -17,7 +17,7 @@ from vjepa2_ac.goals.key_frames import (
 
 
 def make_states(*parts: tuple[int, float, float]) -> np.ndarray:
-    """Return states of parts (number of frames, change of x in metres, change of closedness), linear within a part."""
+    """Return states that change linearly in each part: (number of frames, change of x in metres, of closedness)."""
     x, grip = [0.4], [0.0]
     for frames, metres, closes in parts:
         x += (x[-1] + metres * np.arange(1, frames + 1) / frames).tolist()
@@ -31,25 +31,25 @@ def find_frames_and_names(states: np.ndarray) -> list[tuple[int, str]]:
     return [(key.frame, key.name) for key in find_gripper_key_frames(states)]
 
 
-GO, LIFT = (10, 0.2, 0), (9, 0.2, 0)  # without the gripper
+GO, LIFT = (10, 0.2, 0), (9, 0.2, 0)  # motions without a change of the gripper
 CASES = {
-    "a grasp begins and ends, and the lift is the last": (
+    "a grasp and a lift": (
         (GO, (5, 0, 0.5), GO), [(10, "before closing"), (15, "closed"), (25, "end")],
     ),
-    "a stop counts if it lasts": ((GO, (6, 0, 0), GO), [(10, "stop"), (26, "end")]),
-    "too short": ((GO, (3, 0, 0), GO), [(23, "end")]),
-    "a rest at the start is none": (((6, 0, 0), GO), [(16, "end")]),
-    "an arm that rests at the end had ended before": ((GO, (20, 0, 0)), [(10, "end")]),
-    "likewise after a grasp": ((GO, (4, 0, 0.4), (20, 0, 0)), [(10, "before closing"), (14, "closed")]),
-    "a stop to grip is no key frame of its own": (
+    "a long stop": ((GO, (6, 0, 0), GO), [(10, "stop"), (26, "end")]),
+    "a short stop": ((GO, (3, 0, 0), GO), [(23, "end")]),
+    "a rest at the start": (((6, 0, 0), GO), [(16, "end")]),
+    "a rest at the end": ((GO, (20, 0, 0)), [(10, "end")]),
+    "a rest at the end after a grasp": ((GO, (4, 0, 0.4), (20, 0, 0)), [(10, "before closing"), (14, "closed")]),
+    "stops next to a grasp": (
         (GO, (2, 0, 0), (5, 0, 0.5), (3, 0, 0), LIFT), [(12, "before closing"), (17, "closed"), (29, "end")],
     ),
-    "a grip at the very start has no goal before it": (((5, 0, 0.5), GO), [(5, "closed"), (15, "end")]),
-    "an arm that leaves while the fingers still close has gripped before": (
+    "a grasp at the start": (((5, 0, 0.5), GO), [(5, "closed"), (15, "end")]),
+    "the arm leaves while the fingers still close slowly": (
         (GO, (4, 0, 0.25), (2, 0.04, 0.1), LIFT), [(10, "before closing"), (14, "closed"), (25, "end")],
     ),
-    "it never stood still": ((GO, (6, 0.12, 0.6), LIFT), [(10, "before closing"), (16, "closed"), (25, "end")]),
-    "a pause of the fingers does not divide a grip": (
+    "a grasp without a stop": ((GO, (6, 0.12, 0.6), LIFT), [(10, "before closing"), (16, "closed"), (25, "end")]),
+    "a pause of the fingers within a grasp": (
         (LIFT, (2, 0, 0.2), (2, 0, 0), (2, 0, 0.2), LIFT), [(9, "before closing"), (15, "closed"), (24, "end")],
     ),
 }  # fmt: skip
@@ -76,27 +76,27 @@ def test_key_frames_are_ascending_few_and_exclude_the_start(parts: list) -> None
 
 @given(st.integers(2, 60), st.integers(1, 20))
 def test_every_nth_frame_ends_with_the_last_frame(frames: int, step: int) -> None:
-    found = [key.frame for key in select_every_nth_frame(frames, step)]
-    gaps = np.diff([0, *found])
-    assert found[-1] == frames - 1
+    frame_numbers = [key.frame for key in select_every_nth_frame(frames, step)]
+    gaps = np.diff([0, *frame_numbers])
+    assert frame_numbers[-1] == frames - 1
     assert (gaps[:-1] == step).all()
-    assert step / 2 <= gaps[-1] < 1.5 * step or len(found) == 1
+    assert step / 2 <= gaps[-1] < 1.5 * step or len(frame_numbers) == 1
 
 
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=5), st.integers(1, 6))
-def test_added_frames_keep_key_frames_and_the_step(gaps: list[int], step: int) -> None:
+def test_added_frames_keep_the_key_frames_and_are_about_one_step_apart(gaps: list[int], step: int) -> None:
     keys = [KeyFrame(int(frame), f"key {frame}") for frame in np.cumsum(gaps)]
-    found = add_frames_between(keys, step)
-    assert [key for key in found if key.name != "on the way"] == keys
-    ways = np.diff([0, *(key.frame for key in found)])
-    assert (ways >= 1).all()
-    assert (ways < 1.5 * step).all() if step > 1 else (ways == 1).all()
+    extended = add_frames_between(keys, step)
+    assert [key for key in extended if key.name != "on the way"] == keys
+    distances = np.diff([0, *(key.frame for key in extended)])
+    assert (distances >= 1).all()
+    assert (distances < 1.5 * step).all() if step > 1 else (distances == 1).all()
 
 
 def test_goals_have_durations_and_gripper_modes_of_the_demonstration() -> None:
     states = make_states((10, 0.2, 0), (5, 0, 0.5), (21, 0.2, 0))
     keys = find_gripper_key_frames(states)
-    images = [np.full((16, 16, 3), place, np.uint8) for place in range(len(keys))]
+    images = [np.full((16, 16, 3), number, np.uint8) for number in range(len(keys))]
     goals = make_sub_goals(images, keys, Timing(stride=4, slack=2, share=0.5), states)
     assert [(goal.at_least, goal.at_most) for goal in goals] == [(1, 5), (1, 4), (4, None)]
     assert [goal.gripper for goal in goals] == ["held", "close", "held"]

@@ -181,7 +181,7 @@ def test_inconsistent_recording_raises_with_the_reason(
     assert not list(tmp_path.rglob("*.npz"))
 
 
-# Steps at even times.
+# Frames at uneven times.
 
 
 def convert(folder: Path, times: np.ndarray, *arguments: object, row_times: np.ndarray | None = None) -> Any:
@@ -198,8 +198,8 @@ def convert(folder: Path, times: np.ndarray, *arguments: object, row_times: np.n
 def require_steps(converted_file: Any, expected: np.ndarray) -> None:
     """Check that the states are those of the expected rows, and the frames those of the same rows."""
     assert np.abs(converted_file["states"] - STATES[expected]).max() < 1e-9
-    away = np.abs(converted_file["frames"][:, None].astype(int) - FRAMES).mean(axis=(2, 3, 4))
-    assert np.array_equal(away.argmin(axis=1), expected)
+    distances = np.abs(converted_file["frames"][:, None].astype(int) - FRAMES).mean(axis=(2, 3, 4))
+    assert np.array_equal(distances.argmin(axis=1), expected)
 
 
 UNEVEN = np.r_[0, np.cumsum(np.random.default_rng(0).choice([0.03, 0.1, 0.2, 0.6], STEPS - 1))]
@@ -221,9 +221,9 @@ def test_fps_selects_the_nearest_frame_and_its_pose(has_times: bool, tmp_path: P
     require_steps(converted_file, expected)
 
 
-# Orientation of a phone.
+# Display matrices, as phones write them.
 
-TURNS = {  # matrix of the header: (right, down) of a stored row and a stored column; how the displayed frames differ
+TURNS = {  # display matrix (a, b, c, d) of the video's header, and the displayed frames as a function of the stored
     "90 clockwise": ((0, 1, -1, 0), lambda frames: np.rot90(frames, -1, (1, 2))),
     "90 counterclockwise": ((0, -1, 1, 0), lambda frames: np.rot90(frames, 1, (1, 2))),
     "upside down": ((1, 0, 0, -1), lambda frames: frames[:, ::-1]),
@@ -279,26 +279,26 @@ def test_common_csv_dialects_are_read(text: str | bytes, tmp_path: Path) -> None
     assert np.abs(read_table(tmp_path / "a.csv", text) - STATES).max() < 1e-12
 
 
-ONE = "0.1,0.2,0.3,0.4,0.5,0.6,0.7"
+ROW = "0.1,0.2,0.3,0.4,0.5,0.6,0.7"
 
 
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (f"{EULER_HEADER}\n{ONE}\n,0.2,0.3,0.4,0.5,0.6,0.7", "line 3, column x: an empty cell. Expected a number"),
-        (f"{EULER_HEADER}\n\n{ONE.replace('0.7', 'open')}", "line 3, column gripper: 'open'. Expected a number"),
+        (f"{EULER_HEADER}\n{ROW}\n,0.2,0.3,0.4,0.5,0.6,0.7", "line 3, column x: an empty cell. Expected a number"),
+        (f"{EULER_HEADER}\n\n{ROW.replace('0.7', 'open')}", "line 3, column gripper: 'open'. Expected a number"),
         (f"{EULER_HEADER}\n0,1,0,2,0,3,0,4,0,5,0,6,0,7", "line 2: 14 cells. Expected 7, as in the first line"),
-        (f"{EULER_HEADER},X\n{ONE},1", "2 columns are called x. Rename all but one"),
+        (f"{EULER_HEADER},X\n{ROW},1", "2 columns are called x. Rename all but one"),
         (f"{EULER_HEADER}", "no rows. Expected a line with the names"),
         (PLAIN.encode("utf-16"), r"not a text table .*Save the table as CSV \(UTF-8\)"),
         (
-            f"x,y,z,gripper\n{ONE}",
+            f"x,y,z,gripper\n{ROW}",
             "no columns for the rotation; the table has x, y, z, gripper. Expected roll, pitch, yaw, or",
         ),
-        (f"x,y,z,rx,ry,rz,gripper\n{ONE}", "rx, ry, rz can be rotation_vector, euler_xyz or euler_xyz_degrees. Pass"),
+        (f"x,y,z,rx,ry,rz,gripper\n{ROW}", "rx, ry, rz can be rotation_vector, euler_xyz or euler_xyz_degrees. Pass"),
         ("x,y,z,qx,qy,qz,qw,gripper\n0,0,0,0,0,0,1,0\n0,0,0,0,0,0,0,0", "line 3: 0, 0, 0, 0. Expected quaternion_xyzw"),
-        (f"{EULER_HEADER}\n{ONE.replace('0.1', '412')}", "line 2: 412, 0.2, 0.3. Expected .*5 m.*--position-unit"),
-        (f"{EULER_HEADER}\n{ONE.replace('0.7', '85')}", "line 2: 85. Expected .*0 to 1. Set --gripper-open"),
+        (f"{EULER_HEADER}\n{ROW.replace('0.1', '412')}", "line 2: 412, 0.2, 0.3. Expected .*5 m.*--position-unit"),
+        (f"{EULER_HEADER}\n{ROW.replace('0.7', '85')}", "line 2: 85. Expected .*0 to 1. Set --gripper-open"),
     ],
 )
 def test_invalid_table_raises_with_line_and_column(rows: str | bytes, message: str, tmp_path: Path) -> None:
@@ -378,8 +378,8 @@ def make_messages(
             data, (height, width) = {"bgr8": frame[..., ::-1], "16UC1": frame[..., :2]}[encoding], frame.shape[:2]
             pad = np.zeros((height, 8), np.uint8)  # rows may be longer than their pixels
             rows = np.concatenate([data.reshape(height, -1), pad], axis=1)
-            of_image = (height, width, encoding, 0, rows.shape[1], rows.ravel())
-            image = kinds["sensor_msgs/msg/Image"](header, *of_image)
+            fields = (height, width, encoding, 0, rows.shape[1], rows.ravel())
+            image = kinds["sensor_msgs/msg/Image"](header, *fields)
         yield "/camera", type(image).__msgtype__, time + 0.02, image
 
 
@@ -417,8 +417,8 @@ def test_bag_is_converted_to_one_episode(storage: StoragePlugin, encoding: str, 
     first = 1  # the episode starts at the first frame
     assert np.abs(read_converted_states(out) - STATES[first - 1 : -1]).max() < 1e-6
     with np.load(next(out.glob("*.npz"))) as file:
-        away = np.abs(file["frames"].astype(int) - FRAMES[:-1])
-        assert away.max() == 0 if encoding == "bgr8" else away.mean() < 3
+        differences = np.abs(file["frames"].astype(int) - FRAMES[:-1])
+        assert differences.max() == 0 if encoding == "bgr8" else differences.mean() < 3
 
 
 @pytest.mark.parametrize(
@@ -474,7 +474,7 @@ def run_in_subprocess(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 def test_lance_tables_are_converted_to_the_original_files(tmp_path: Path) -> None:
-    """The original files are the tests' data set; lerobot-lancedb wrote the tables from them."""
+    """The original files are a data set of the tests. lerobot-lancedb wrote the tables from these files."""
     original, out = GOLDEN / "lerobot_lance/original", tmp_path / "files"
     process = run_in_subprocess(ROOT / "examples/convert/lance_to_files.py", GOLDEN / "lerobot_lance/tables", out)
     assert process.returncode == 0, process.stderr
@@ -484,9 +484,9 @@ def test_lance_tables_are_converted_to_the_original_files(tmp_path: Path) -> Non
     assert len(videos) == 4
     assert all((out / path).read_bytes() == (original / path).read_bytes() for path in videos)
     for path in (path for path in files if path.parts[0] == "data"):
-        ours, theirs = (parquet.read_table(root / path) for root in (out, original))
-        assert ours.column_names == theirs.column_names
-        assert ours.to_pylist() == theirs.to_pylist()
+        converted, expected = (parquet.read_table(root / path) for root in (out, original))
+        assert converted.column_names == expected.column_names
+        assert converted.to_pylist() == expected.to_pylist()
     assert read_properties(str(out)).source == "lerobot"
 
 

@@ -82,7 +82,7 @@ def test_line_breaks_in_names_cannot_add_config_keys(between: str) -> None:
     assert parse_config(parse_yaml(config_as_yaml(read), where="run"), where="run") == read
 
 
-def test_share_of_a_single_episode_is_exact() -> None:
+def test_comment_for_a_single_episode_states_the_exact_number() -> None:
     config_text = make(replace(PROPERTIES, episodes=1)).to_yaml(PROPERTIES, MACHINE)
     assert "# 1 of 1 episode, selected by a hash" in config_text
 

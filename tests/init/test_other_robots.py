@@ -41,16 +41,16 @@ def propose_pose(names: str, numbers: list[Numbers] | None) -> dict[str, DraftVa
 
 
 def max_rotation_error_deg(pose: dict[str, DraftValue], numbers: Numbers, states: Numbers) -> float:
-    """Return the largest angle between the rotations that a proposal reads and the true ones."""
+    """Return the largest angle between the true rotations and those that are read with a proposed pose, in degrees."""
     values = {"run_dir": "none", "data": {"source": "lerobot", "path": "none", "lerobot": plain_values(pose)}}
     config = parse_config({**values, "model": {"base": "builtin:sim-tiny"}}, where="init").data
     assert isinstance(config, LeRobotData)
     fields = config.lerobot
-    chosen = numbers if fields.select is None else numbers[:, list(fields.select)]
-    read = convert_poses(chosen, fields, "episode", section="data.lerobot")
+    selected = numbers if fields.select is None else numbers[:, list(fields.select)]
+    read = convert_poses(selected, fields, "episode", section="data.lerobot")
     assert np.allclose(read[:, :3], states[:, :3])
-    away = Rotation.from_euler("xyz", read[:, 3:6]) * Rotation.from_euler("xyz", states[:, 3:6]).inv()
-    return float(np.rad2deg(away.magnitude()).max())
+    errors = Rotation.from_euler("xyz", read[:, 3:6]) * Rotation.from_euler("xyz", states[:, 3:6]).inv()
+    return float(np.rad2deg(errors.magnitude()).max())
 
 
 @pytest.mark.parametrize(
@@ -84,23 +84,20 @@ def test_rotation_format_is_recognised(names: str, rotation: str, is_guess: bool
 
 
 @pytest.mark.parametrize(
-    ("names", "rotation", "other"),
-    [
-        ("x y z roll pitch yaw gripper", "rotation_vector", "rotation_vector"),
-        ("x y z wx wy wz gripper", "euler_xyz", "euler_xyz"),
-    ],
+    ("names", "rotation"),
+    [("x y z roll pitch yaw gripper", "rotation_vector"), ("x y z wx wy wz gripper", "euler_xyz")],
 )
-def test_values_override_contradicting_column_names_as_a_guess(names: str, rotation: str, other: str) -> None:
+def test_values_override_contradicting_column_names_as_a_guess(names: str, rotation: str) -> None:
     numbers = [convert_states(states, rotation) for states in EPISODES]
     pose = propose_pose(names, numbers)
-    assert (pose["rotation"].value, pose["rotation"].is_guess) == (other, True)
+    assert (pose["rotation"].value, pose["rotation"].is_guess) == (rotation, True)
     assert "which the names suggest" in pose["rotation"].reason
 
 
-def test_quaternion_names_on_rotation_vector_and_two_fingers_give_a_guess() -> None:
-    fingers = [np.stack([0.04 * (1 - one[:, 6]), -0.04 * (1 - one[:, 6])], axis=1) for one in EPISODES]
-    parts = zip(EPISODES, fingers, strict=True)
-    numbers = [np.concatenate([convert_states(one, "rotation_vector")[:, :6], two], 1) for one, two in parts]
+def test_rotation_vector_with_quaternion_names_and_two_fingers_is_a_guess() -> None:
+    fingers = [np.stack([0.04 * (1 - states[:, 6]), -0.04 * (1 - states[:, 6])], axis=1) for states in EPISODES]
+    poses = [convert_states(states, "rotation_vector")[:, :6] for states in EPISODES]
+    numbers = [np.concatenate([pose, both], axis=1) for pose, both in zip(poses, fingers, strict=True)]
     pose = propose_pose("x y z rx ry rz rw gripper", numbers)
     assert (pose["rotation"].value, pose["select"].value) == ("rotation_vector", [0, 1, 2, 3, 4, 5, 6])
     assert pose["state"].is_guess
@@ -117,7 +114,7 @@ def test_named_pose_with_gripper_column_is_not_a_guess() -> None:
 
 
 def test_degrees_and_millimetres_are_recognised_by_magnitude() -> None:
-    numbers = [convert_states(one, "euler_xyz_degrees") * [1000, 1000, 1000, 1, 1, 1, 1] for one in EPISODES]
+    numbers = [convert_states(states, "euler_xyz_degrees") * [1000, 1000, 1000, 1, 1, 1, 1] for states in EPISODES]
     pose = propose_pose("x y z roll pitch yaw gripper", numbers)
     assert (pose["rotation"].value, pose["position_unit"].value) == ("euler_xyz_degrees", "mm")
     assert "position_unit" in list_guesses(pose)
@@ -174,15 +171,13 @@ def test_columns_of_two_arms_are_not_mixed() -> None:
     assert "observation.right_ee_pose" in pose["state"].reason
 
 
-@pytest.mark.parametrize(
-    ("rotation", "found"), [("quaternion_xyzw", "quaternion_xyzw"), ("rotation_vector", "rotation_vector")]
-)
-def test_eight_unnamed_numbers_are_split_by_quaternion_norm(rotation: str, found: str) -> None:
-    numbers = [convert_states(one, rotation) for one in EPISODES]
-    numbers = [one if one.shape[1] == 8 else np.concatenate([one, -one[:, 6:]], axis=1) for one in numbers]
+@pytest.mark.parametrize("rotation", ["quaternion_xyzw", "rotation_vector"])
+def test_eight_unnamed_numbers_are_split_by_quaternion_norm(rotation: str) -> None:
+    numbers = [convert_states(states, rotation) for states in EPISODES]
+    numbers = [states if states.shape[1] == 8 else np.concatenate([states, -states[:, 6:]], 1) for states in numbers]
     pose = find_pose({STATE: Column(8)}, {STATE: numbers})
     assert pose is not None
-    assert (pose["rotation"].value, pose["state"].is_guess) == (found, True)
+    assert (pose["rotation"].value, pose["state"].is_guess) == (rotation, True)
     assert plain_values(pose).get("select") == (None if rotation.startswith("quaternion") else [0, 1, 2, 3, 4, 5, 6])
 
 
@@ -210,13 +205,13 @@ def test_gripper_values_follow_from_range_and_name(
     assert bool(list_guesses(values)) == is_guess
 
 
-def chosen_names(names: str) -> list[str]:
-    """Return the names of the numbers that are propose_pose; empty: no pose."""
-    named = tuple(names.split())
-    pose = find_pose({STATE: Column(len(named), named)})
+def select_names(names: str) -> list[str]:
+    """Return the names of the numbers that are selected as the pose; empty: no pose is recognised."""
+    all_names = tuple(names.split())
+    pose = find_pose({STATE: Column(len(all_names), all_names)})
     if pose is None:
         return []
-    return [named[index] for index in (pose["select"].value if "select" in pose else range(len(named)))]
+    return [all_names[index] for index in (pose["select"].value if "select" in pose else range(len(all_names)))]
 
 
 @pytest.mark.parametrize(
@@ -224,7 +219,7 @@ def chosen_names(names: str) -> list[str]:
     [
         ("x y z qx qy qz qw vx vy vz wx wy wz gripper", "x y z qx qy qz qw gripper"),
         ("x y z rx ry rz vx vy vz wx wy wz gripper", "x y z rx ry rz gripper"),
-        ("x y z wx wy wz vx vy vz gripper", ""),  # an angular velocity is no rotation
+        ("x y z wx wy wz vx vy vz gripper", ""),  # an angular velocity is not a rotation
         ("x y z wx wy wz roll pitch yaw gripper", "x y z roll pitch yaw gripper"),
         ("theta_1 theta_2 theta_3 x y z rx ry rz gripper", "x y z rx ry rz gripper"),
         ("angle1 angle2 angle3 x y z gripper", ""),
@@ -239,7 +234,7 @@ def chosen_names(names: str) -> list[str]:
     ],
 )
 def test_other_quantities_are_not_recognised_as_the_pose(names: str, expected: str) -> None:
-    assert chosen_names(names) == expected.split()
+    assert select_names(names) == expected.split()
 
 
 @pytest.mark.parametrize(
@@ -268,13 +263,13 @@ def test_pose_of_an_object_is_not_recognised_as_the_robots(name: str) -> None:
 
 def test_robosuite_columns_are_recognised() -> None:
     samples = {
-        "observation.robot0_eef_pos": [one[:, :3] for one in EPISODES],
-        "observation.robot0_eef_quat": [convert_states(one, "quaternion_xyzw")[:, 3:7] for one in EPISODES],
-        "observation.robot0_gripper_qpos": [np.stack([0.04 * (1 - one[:, 6])] * 2, axis=1) for one in EPISODES],
+        "observation.robot0_eef_pos": [states[:, :3] for states in EPISODES],
+        "observation.robot0_eef_quat": [convert_states(states, "quaternion_xyzw")[:, 3:7] for states in EPISODES],
+        "observation.robot0_gripper_qpos": [np.stack([0.04 * (1 - states[:, 6])] * 2, axis=1) for states in EPISODES],
         "observation.robot0_joint_pos": list(EPISODES),
-        "observation.robot0_gripper_qvel": [one[:, :2] for one in EPISODES],
+        "observation.robot0_gripper_qvel": [states[:, :2] for states in EPISODES],
     }
-    pose = find_pose({name: Column(one[0].shape[1]) for name, one in samples.items()}, samples)
+    pose = find_pose({name: Column(episodes[0].shape[1]) for name, episodes in samples.items()}, samples)
     assert pose is not None
     assert pose["state"].value == list(samples)[:3]
     assert pose["select"].value == [0, 1, 2, 3, 4, 5, 6, 7]

@@ -30,7 +30,7 @@ def rename_dataset(folder: Path, name: str) -> Path:
 
 
 def make_draft_of(path: Path) -> tuple[dict[str, Any], dict[str, str], str]:
-    """Return the values of `data`, all list_guesses and the text of the config for a set."""
+    """Return the section `data`, all guesses and the text of the drafted config for a data set."""
     properties = read_properties(str(path))
     made = make_draft(properties, LAPTOP, choose_model("builtin:sim-tiny"), run_dir="run")
     return plain_values(made.config_values)["data"], list_guesses(made.config_values), made.to_yaml(properties, LAPTOP)
@@ -71,7 +71,7 @@ def test_states_without_a_pose_become_a_vector(tmp_path: Path) -> None:
     folder = write_lerobot(tmp_path / "set", range(3))
     info = json.loads((folder / "meta/info.json").read_text())
     joints = {"dtype": "float32", "shape": [6], "names": [f"joint_{number}" for number in range(6)]}
-    cameras = {name: one for name, one in info["features"].items() if one["dtype"] == "video"}
+    cameras = {name: feature for name, feature in info["features"].items() if feature["dtype"] == "video"}
     info["features"] = cameras | {"observation.state": joints}
     (folder / "meta/info.json").write_text(json.dumps(info))
     properties = read_properties(str(folder))
@@ -93,7 +93,7 @@ def test_camera_of_the_config_maps_to_the_chosen_feature(form: str, features: li
         folder = write_lerobot(tmp_path / "set", range(2))
         info = json.loads((folder / "meta/info.json").read_text())
         video = info["features"]["observation.images.wrist_left"]
-        numbers = {name: one for name, one in info["features"].items() if one["dtype"] != "video"}
+        numbers = {name: feature for name, feature in info["features"].items() if feature["dtype"] != "video"}
         info["features"] = numbers | dict.fromkeys(keys, video)
         (folder / "meta/info.json").write_text(json.dumps(info))
     data, guessed, _ = make_draft_of(folder)
@@ -106,7 +106,7 @@ def test_camera_of_the_config_maps_to_the_chosen_feature(form: str, features: li
 def test_depth_maps_are_not_offered_as_cameras(tmp_path: Path) -> None:
     folder = write_lerobot(tmp_path / "set", range(3))
     info = json.loads((folder / "meta/info.json").read_text())
-    keys = [name for name, one in info["features"].items() if one["dtype"] == "video"]
+    keys = [name for name, feature in info["features"].items() if feature["dtype"] == "video"]
     for number, key in enumerate(keys):
         info["features"][key]["info"] = {"is_depth_map": True}
         (folder / "meta/info.json").write_text(json.dumps(info))
@@ -118,7 +118,7 @@ def test_depth_maps_are_not_offered_as_cameras(tmp_path: Path) -> None:
         read_properties(str(folder))
 
 
-def test_data_set_with_the_schema_of_droid_is_droid_only_with_its_name(tmp_path: Path) -> None:
+def test_data_set_with_droids_features_is_treated_as_droid_only_with_droids_name(tmp_path: Path) -> None:
     folder = WRITERS["rlds"](tmp_path / "bridge/1.0.0", range(3))
     for name in ("r2d2_faceblur", "droid_101"):
         data, guessed, text = make_draft_of(rename_dataset(folder, name))
@@ -133,7 +133,7 @@ def test_data_set_with_the_schema_of_droid_is_droid_only_with_its_name(tmp_path:
     assert "the released model was trained on this camera" not in text
 
 
-def test_simulated_data_set_has_a_known_rate_and_is_not_called_droid(tmp_path: Path) -> None:
+def test_simulated_data_set_has_a_known_rate_and_is_not_described_as_droid(tmp_path: Path) -> None:
     folder = WRITERS["rlds"](tmp_path / "set", range(3))
     (folder / SIMULATION_FILE).write_text("{}")
     data, guessed, text = make_draft_of(folder)

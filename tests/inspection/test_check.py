@@ -65,7 +65,7 @@ def test_plausible_batch_has_only_ok_findings() -> None:
         ("actions", "warning", "the steps are long", {"actions": good()["actions"] * 10}),
     ],
 )  # fmt: skip
-def test_implausible_batch_gives_the_finding_of_its_fault(
+def test_implausible_values_in_a_batch_raise_the_matching_finding(
     about: str, level: str, words: str, changes: dict[str, torch.Tensor]
 ) -> None:
     finding = found_in(**changes)[about]

@@ -39,26 +39,26 @@ def dataset(data_folder: Path) -> Dataset:
 
 def test_each_frame_is_predicted_from_the_previous_frame(whole_run: Path, dataset: Dataset) -> None:
     model = load_run(whole_run, device="cpu").world_model
-    (found,) = measure_episodes(model, dataset, [2])
+    (measured,) = measure_episodes(model, dataset, [2])
     episode = dataset.source.read(2)
-    assert found.steps.tolist() == list(range(STRIDE, len(episode.states), STRIDE))
-    assert found.errors.shape == (len(found.steps), model.num_tokens)
-    usual = found.errors.mean(axis=0)
-    scores = found.compute_scores(usual)
-    np.testing.assert_allclose(scores, np.maximum(found.errors - usual, 0).mean(axis=1), rtol=1e-6)
-    by = calibrate_monitor(model, dataset, 0.3)
+    assert measured.steps.tolist() == list(range(STRIDE, len(episode.states), STRIDE))
+    assert measured.errors.shape == (len(measured.steps), model.num_tokens)
+    usual = measured.errors.mean(axis=0)
+    scores = measured.compute_scores(usual)
+    np.testing.assert_allclose(scores, np.maximum(measured.errors - usual, 0).mean(axis=1), rtol=1e-6)
+    monitor = calibrate_monitor(model, dataset, 0.3)
     for threshold, expected in ((scores.max(), None), (scores.max() - 1e-9, int(scores.argmax()))):
-        assert found.find_first_alarm(replace(by, expected=tuple(usual), threshold=threshold)) == expected
+        assert measured.find_first_alarm(replace(monitor, expected=tuple(usual), threshold=threshold)) == expected
 
 
 def test_threshold_uses_held_out_episodes_only(whole_run: Path, dataset: Dataset) -> None:
     model = load_run(whole_run, device="cpu").world_model
     monitor = calibrate_monitor(model, dataset, 0.3)
     held_out = np.flatnonzero(dataset.split_mask("validation") | dataset.split_mask("test"))
-    watched = list(measure_episodes(model, dataset, held_out.tolist()))
-    np.testing.assert_allclose(monitor.expected, np.concatenate([one.errors for one in watched]).mean(axis=0))
-    others = np.concatenate([one.errors for one in watched[1:]]).mean(axis=0)
-    assert monitor.scores[0] == pytest.approx(watched[0].compute_scores(others).max())
+    measured = list(measure_episodes(model, dataset, held_out.tolist()))
+    np.testing.assert_allclose(monitor.expected, np.concatenate([episode.errors for episode in measured]).mean(axis=0))
+    usual = np.concatenate([episode.errors for episode in measured[1:]]).mean(axis=0)
+    assert monitor.scores[0] == pytest.approx(measured[0].compute_scores(usual).max())
     assert monitor.threshold in monitor.scores
 
 
@@ -82,16 +82,16 @@ def test_monitor_command_detects_a_corrupted_image(
     assert "planning.views: 2" in capsys.readouterr().err
     assert main(words) == 0
     assert json.loads((run / MONITOR).read_text())["false_alarms"] == 0.4
-    watch = [*words, "--data", str(tmp_path / "today.yaml"), "--threshold", str(run), "--out", str(tmp_path / "out")]
-    assert main([*watch, "--episode", "bad", "--episode", "good"]) == 1
-    said = " ".join(capsys.readouterr().out.split())
-    assert "first alarm" in said
-    assert main([*watch, "--episode", "none"]) == 2
+    check = [*words, "--data", str(tmp_path / "today.yaml"), "--threshold", str(run), "--out", str(tmp_path / "out")]
+    assert main([*check, "--episode", "bad", "--episode", "good"]) == 1
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "first alarm" in printed
+    assert main([*check, "--episode", "none"]) == 2
     assert main([*words[:-1], "0.01"]) == 2
     assert "held-out episodes" in capsys.readouterr().err
 
 
-# ---- the surprise of a frame, and the threshold ----
+# ---- surprise and threshold ----
 
 
 def write_monitor(folder: Path, threshold: float) -> str:
@@ -103,13 +103,13 @@ def write_monitor(folder: Path, threshold: float) -> str:
 
 
 def run_controller(monitor: str | None, frames: int = 4, **changes: object) -> list:
-    run = Controller(tiny_model(), QUICK.model_copy(update={"monitor": monitor, "horizon": 3, **changes}))
-    run.reset(image(100))
-    found = []
+    controller = Controller(tiny_model(), QUICK.model_copy(update={"monitor": monitor, "horizon": 3, **changes}))
+    controller.reset(image(100))
+    decisions = []
     for seed in range(frames):
-        run.act(image(seed), STATE)
-        found.append(run.decision)
-    return found
+        controller.act(image(seed), STATE)
+        decisions.append(controller.decision)
+    return decisions
 
 
 @settings(max_examples=30)
@@ -129,19 +129,16 @@ def test_too_few_episodes_for_a_threshold_raise(count: int, share: float) -> Non
 
 def test_surprise_is_the_mean_excess_over_the_usual_error() -> None:
     errors, usual = torch.zeros(2, 4), torch.tensor([1.0, 0.0, 0.0, 0.0])
-    errors[0, 0], errors[1, 0], errors[1, 3] = (
-        1.0,
-        3.0,
-        2.0,
-    )  # in a patch with usually large errors, and in one with small errors
+    errors[0, 0] = 1.0  # equal to the usual error of the patch
+    errors[1, 0], errors[1, 3] = 3.0, 2.0  # excess 2 in both patches
     assert compute_surprise(errors, usual).tolist() == [0.0, 1.0]
 
 
 def test_nan_surprise_is_an_alarm(tmp_path: Path) -> None:
     monitor = Monitor.read(write_monitor(tmp_path, 9.0), tiny_model().fingerprints(), tokens=9, where="test")
-    still = torch.zeros(9, 5)
-    assert not monitor.compare(still, still).is_alarm
-    assert monitor.compare(still, torch.full_like(still, float("nan"))).is_alarm
+    latents = torch.zeros(9, 5)
+    assert not monitor.compare(latents, latents).is_alarm
+    assert monitor.compare(latents, torch.full_like(latents, float("nan"))).is_alarm
 
 
 def test_monitor_compares_the_last_prediction_with_the_current_frame(tmp_path: Path) -> None:
@@ -152,10 +149,10 @@ def test_monitor_compares_the_last_prediction_with_the_current_frame(tmp_path: P
     np.testing.assert_allclose(second.surprise.errors, expected, rtol=1e-5)
     assert not second.surprise.is_alarm
     assert run_controller(write_monitor(tmp_path, 1e-6))[1].surprise.is_alarm
-    assert all(one.surprise is None for one in run_controller(None))
+    assert all(decision.surprise is None for decision in run_controller(None))
 
 
-def test_mismatched_monitor_settings_and_files_raise(tmp_path: Path) -> None:
+def test_monitor_of_another_model_or_without_a_threshold_raises(tmp_path: Path) -> None:
     path = write_monitor(tmp_path, 1.0)
     known = json.loads(Path(path).read_text())
     Path(path).write_text(json.dumps(known | {"predictor": "0" * 64}))
@@ -169,12 +166,12 @@ def test_mismatched_monitor_settings_and_files_raise(tmp_path: Path) -> None:
 def test_server_reports_an_alarm_in_its_reply_and_counts_it(tmp_path: Path) -> None:
     config = QUICK.model_copy(update={"monitor": write_monitor(tmp_path, 1e-6)})
     session = Session(Controller(tiny_model(), config))
-    answers = []
+    replies = []
     for seed in range(2):
-        asked = {"observation/image": image(seed), "observation/state": STATE, "goal/image": image(100)}
-        answers.append(unpack(session.reply_to(pack(asked))))
-    assert "surprise" not in answers[0]
-    assert answers[1]["surprise"]["is_alarm"]
-    assert any("differs from the predicted frame" in note for note in answers[1]["notes"])
+        request = {"observation/image": image(seed), "observation/state": STATE, "goal/image": image(100)}
+        replies.append(unpack(session.reply_to(pack(request))))
+    assert "surprise" not in replies[0]
+    assert replies[1]["surprise"]["is_alarm"]
+    assert any("differs from the predicted frame" in note for note in replies[1]["notes"])
     assert session.counts.alarms == 1
-    assert session.counts.surprise == answers[1]["surprise"]["score"]
+    assert session.counts.surprise == replies[1]["surprise"]["score"]

@@ -45,33 +45,34 @@ def folder(tmp_path: Path) -> Path:
 
 
 def make_controller(folder: Path | None, **changes: object) -> Controller:
+    """Return a controller after its first decision."""
     config = QUICK.model_copy(update={"prior": folder and str(folder), **changes})
-    run = Controller(tiny_model(), config)
-    run.reset(image(100))
-    run.act(image(0), STATE)
-    return run
+    controller = Controller(tiny_model(), config)
+    controller.reset(image(100))
+    controller.act(image(0), STATE)
+    return controller
 
 
 def test_prior_planner_acts_within_the_limits_without_search(folder: Path) -> None:
-    run = make_controller(folder, planner=Component("prior"), limits=LimitsConfig(xyz=(0.05, 0.01, 0.05)))
-    np.testing.assert_allclose(run.decision.action, [0.03, -0.01, 0.01, 0, 0, 0, 0.3], atol=1e-6)
-    assert run.decision.plan.evaluations == 1
-    assert run.decision.why == "planned"
+    controller = make_controller(folder, planner=Component("prior"), limits=LimitsConfig(xyz=(0.05, 0.01, 0.05)))
+    np.testing.assert_allclose(controller.decision.action, [0.03, -0.01, 0.01, 0, 0, 0, 0.3], atol=1e-6)
+    assert controller.decision.plan.evaluations == 1
+    assert controller.decision.why == "planned"
 
 
 @pytest.mark.parametrize("planner", ["cem", "icem", "mppi", "gradient"])
 def test_search_starts_from_the_mean_and_std_of_the_prior(folder: Path, planner: str) -> None:
-    run = make_controller(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
-    first = run.decision.plan.iterations[0]
+    controller = make_controller(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
+    first = controller.decision.plan.iterations[0]
     spread = np.sqrt(2) * np.exp(-3.0)
-    far = (first.elites[:, 0, :3] - torch.tensor(MEAN[:3])).abs().max()
-    assert far <= 5 * spread
+    distance = (first.elites[:, 0, :3] - torch.tensor(MEAN[:3])).abs().max()
+    assert distance <= 5 * spread
     if planner in {"cem", "icem"}:
         assert not torch.allclose(
             first.mean, make_controller(None, planner=Component(planner), iterations=1, horizon=1).space.lower
         )
     again = make_controller(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
-    np.testing.assert_array_equal(run.decision.action, again.decision.action)
+    np.testing.assert_array_equal(controller.decision.action, again.decision.action)
 
 
 def test_prior_of_several_steps_uses_predicted_frames(tmp_path: Path) -> None:
@@ -79,23 +80,23 @@ def test_prior_of_several_steps_uses_predicted_frames(tmp_path: Path) -> None:
     prior, model = ActionPrior(SIZES).eval().requires_grad_(False), tiny_model()
     card = PriorCard("vjepa2-ac prior 1", SIZES, model.encoder_fingerprint(), "released", "nowhere", 0)
     save_prior(tmp_path / "prior", card, prior)
-    run = make_controller(
+    controller = make_controller(
         tmp_path / "prior",
         planner=Component("prior"),
         horizon=3,
         limits=LimitsConfig(xyz=(1.0,) * 3, rotation=3.0, gripper=1.0),
     )
-    cost, wanted = run.decision.cost, run.encode(image(100))
-    seen, state = cost.current
-    for step, action in enumerate(run.decision.plan.actions):
-        left = torch.tensor([max(1, 3 - step)])
-        mean, _ = prior(seen[None], wanted[None], left, state[None])
-        np.testing.assert_allclose(action, run.space.clip(mean.expand(3, -1))[0], atol=1e-5)
-        predicted, states = cost.rollout(run.decision.plan.actions[None, : step + 1])
-        seen, state = predicted[0, -1], states[0, -1]
+    cost, goal = controller.decision.cost, controller.encode(image(100))
+    frame, state = cost.current
+    for step, action in enumerate(controller.decision.plan.actions):
+        remaining = torch.tensor([max(1, 3 - step)])
+        mean, _ = prior(frame[None], goal[None], remaining, state[None])
+        np.testing.assert_allclose(action, controller.space.clip(mean.expand(3, -1))[0], atol=1e-5)
+        predicted, states = cost.rollout(controller.decision.plan.actions[None, : step + 1])
+        frame, state = predicted[0, -1], states[0, -1]
 
 
-def test_prior_of_another_encoder_or_damaged_file_raises(folder: Path) -> None:
+def test_prior_of_another_encoder_or_with_damaged_files_raises(folder: Path) -> None:
     card = json.loads((folder / CARD).read_text())
     (folder / CARD).write_text(json.dumps(card | {"encoder": "0" * 64}))
     with pytest.raises(InputError, match=r"a prior for encoder"):
@@ -109,9 +110,7 @@ def test_prior_of_another_encoder_or_damaged_file_raises(folder: Path) -> None:
         load_prior(folder, where="planning.prior")
 
 
-def test_prior_training_is_deterministic_beats_zero_action_and_uses_the_goal(
-    make_config: MakeConfig, tmp_path: Path
-) -> None:
+def test_prior_training_is_deterministic_and_measures_held_out_errors(make_config: MakeConfig, tmp_path: Path) -> None:
     """The actions of the episodes are random, so only the goal determines which action leads to it."""
     config, reporter = make_config(), SilentReporter()
     first = train_prior(config, tmp_path / "a", PriorOptions(steps=60, batch_size=8), reporter)
@@ -128,9 +127,9 @@ def test_prior_command_writes_into_the_run_and_prints_the_planning_command(
 ) -> None:
     out = tmp_path / "prior"
     assert main(["prior", str(whole_run), "--steps", "3", "--out", str(out)]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "relative to the zero action" in said
-    assert "planning.prior=" in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "relative to the zero action" in printed
+    assert "planning.prior=" in printed
     assert main(["prior", str(tmp_path)]) == 2
 
 

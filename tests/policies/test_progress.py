@@ -18,7 +18,7 @@ def test_progress_is_0_at_the_start_and_1_at_the_end(
     rows = parquet.read_table(tmp_path / "progress.parquet").to_pylist()
     assert {tuple(row) for row in rows} == {("episode_index", "frame_index", "episode", "progress")}
     for episode in range(8):
-        own = [row for row in rows if row["episode_index"] == episode]
-        assert [row["frame_index"] for row in own] == sorted({*range(0, 23, every), 23})
-        assert (own[0]["progress"], own[-1]["progress"]) == (0.0, pytest.approx(1.0, abs=1e-5))
+        episode_rows = [row for row in rows if row["episode_index"] == episode]
+        assert [row["frame_index"] for row in episode_rows] == sorted({*range(0, 23, every), 23})
+        assert (episode_rows[0]["progress"], episode_rows[-1]["progress"]) == (0.0, pytest.approx(1.0, abs=1e-5))
     assert "held-out episodes (1 is best)" in capsys.readouterr().out

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from made_pages import _leaves
-from vjepa2_ac.cli.options import as_config, as_local, as_model, as_path, as_place
-from vjepa2_ac.cli.program import _parser, main
+from vjepa2_ac.cli.options import as_config, as_local, as_model, as_path, as_path_or_url
+from vjepa2_ac.cli.program import _make_parser, main
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.config.loading import all_keys, config_as_flat_dict, parse_config
 from vjepa2_ac.data.index import cache_folder
@@ -81,19 +81,19 @@ def test_cache_environment_variable_is_resolved_like_a_path_key(monkeypatch: pyt
 def test_all_path_options_use_the_same_resolution() -> None:
     path_words = {"CONFIG", "FOLDER", "DIR", "PATH", "PNG", "IMAGE", "RUN", "MODEL", "RUN_OR_MODEL"}
     num_path_options = 0
-    actions = ((words, action) for words, parser in _leaves(_parser(), ()) for action in parser._actions)
+    actions = ((words, action) for words, parser in _leaves(_make_parser(), ()) for action in parser._actions)
     for command, action in actions:
         is_path = path_words & set(str(action.metavar).replace("|", " ").split())
         if is_path and action.dest != "overrides":
             num_path_options += 1
-            readers = {as_config, as_path, as_local, as_model, as_place}
+            readers = {as_config, as_path, as_local, as_model, as_path_or_url}
             assert action.type in readers, f"{command}: {action.dest}"
     assert num_path_options > 20
 
 
 def test_path_option_expands_home_and_rejects_urls(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setenv("HOME", "/home/of/mine")
-    options = _parser().parse_args(["data", "inspect", "~/c.yaml", "--out=~/x"])
+    options = _make_parser().parse_args(["data", "inspect", "~/c.yaml", "--out=~/x"])
     assert (options.config, options.out) == ("/home/of/mine/c.yaml", Path("/home/of/mine/x"))
     for arguments in (["export", "run", "gs://b/x"], ["evaluate", "run", "--out=gs:/b"], ["train", "s3://b/run"]):
         with pytest.raises(SystemExit, match="2"):

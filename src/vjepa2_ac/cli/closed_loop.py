@@ -28,15 +28,15 @@ if TYPE_CHECKING:
     from vjepa2_ac.simulation.benchmark import BenchmarkOptions, ClosedLoopBenchmark
     from vjepa2_ac.simulation.manifest import Manifest
 
-_OF_RECORD = ("cameras", "workers")
-_OF_A_MANIFEST = ("task", "domain", "episodes", "steps", "seed", "sub_goals")
-_OF_A_MODEL = ("sub_goals", "manifest", "films", "checkpoint", "config", "out")
+_RECORD_OPTIONS = ("cameras", "workers")
+_MANIFEST_OPTIONS = ("task", "domain", "episodes", "steps", "seed", "sub_goals")
+_MODEL_OPTIONS = ("sub_goals", "manifest", "films", "checkpoint", "config", "out")
 
 
 def add_serve(commands: cli.Commands) -> None:
     """Add `serve` to a parser."""
-    parser = cli.command(commands, "serve", _serve, "demo/run --goals goals --key-file key --host 0.0.0.0")
-    cli.add_planner(parser, such_as="such as planning.limits.xyz=[0.01,0.01,0.01]")
+    parser = cli.add_command(commands, "serve", _serve, "demo/run --goals goals --key-file key --host 0.0.0.0")
+    cli.add_planner(parser, "such as planning.limits.xyz=[0.01,0.01,0.01]")
     cli.add(
         parser,
         "--goals FOLDER",
@@ -72,15 +72,16 @@ def add_serve(commands: cli.Commands) -> None:
 
 def add_simulate(commands: cli.Commands) -> None:
     """Add `simulate` to a parser. `simulate record` records data; otherwise a model is tested in closed loop."""
-    parser = cli.command(commands, "simulate", _simulate, "demo/run --task reach --domain B --episodes 10")
-    cli.add(parser, "subject RUN_OR_MODEL|record", "a run, or a value of model.base; or the word record", cli.as_model)
-    cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: the output folder", nargs="*")
+    parser = cli.add_command(commands, "simulate", _simulate, "demo/run --task reach --domain B --episodes 10")
+    cli.add(parser, "subject RUN_OR_MODEL|record", "a run, a value of model.base, or the word record", cli.as_model)
+    text = "such as planning.samples=64; record: the output folder"
+    cli.add(parser, "overrides key=value|FOLDER", text, nargs="*", default=[])
     text = "the task (reach); record: push, pick or place with a block on the table (none: random reaching)"
     cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
     cli.add(
         parser,
         "--domain",
-        "domain of the arm; random: a new random scene in each episode, only to record (A)",
+        "domain of the arm; only to record: random, a new random scene in each episode (A)",
         choices=["A", "B", "random"],
     )
     cli.add(parser, "--episodes N", "number of problems (50); record: number of episodes (40)", cli.count)
@@ -91,27 +92,27 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add(
         parser,
         "--world-timeout SECONDS",
-        "time limit for an answer of the environment; the first may take five times as long (120)",
+        "time limit of an answer from the environment; the first answer may take five times as long (120)",
         seconds,
     )
     group = parser.add_argument_group("to test a model")
     cli.add_all(group)
     cli.add_checkpoint(group, default=None)
-    cli.add(group, "--config CONFIG", "for a model: the config whose `planning` is used", cli.as_local)
+    cli.add(group, "--config CONFIG", "for a model: the config with the section planning", cli.as_local)
     text = "sub-goals from the oracle's solution: its key frames, or every model step (none)"
     cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
     text = "problems, steps and planning settings of a table: read from this file, or written to it if it is new"
     cli.add(group, "--manifest FILE", text, cli.as_path)
-    cli.add(group, "--films N", "episodes in the video; 0: none (6)", cli.whole_number(0))
+    cli.add(group, "--films N", "episodes in the video; 0: no video (6)", cli.whole_number(0))
     cli.add(group, "--out FOLDER", "output folder (closed_loop/TASK-DOMAIN in the run's folder)", cli.as_path)
     group = parser.add_argument_group("to record data")
     cli.add(
         group,
         "--cameras N",
-        "number of cameras that are rendered, 1 to 3; the others repeat the first (1)",
+        "number of rendered cameras, 1 to 3; further cameras repeat the first (1)",
         cli.whole_number(1, 3),
     )
-    cli.add(group, "--workers N", "number of processes; the data do not depend on it (1)", cli.count)
+    cli.add(group, "--workers N", "number of processes, which does not change the data (1)", cli.count)
 
 
 def _serve(options: argparse.Namespace) -> int:
@@ -126,7 +127,7 @@ def _serve(options: argparse.Namespace) -> int:
     access = Access(options.host, key, options.insecure, tuple(options.allow_host))
     if options.goals is not None and not options.goals.is_dir():
         raise InputError(where=f"--goals {options.goals}", found="no such folder", needed="a folder with goals")
-    cli.require_to_plan(options)
+    cli.read_planning_config(options)
 
     from vjepa2_ac.serving.metadata import read_named_goals
     from vjepa2_ac.serving.server import serve
@@ -134,15 +135,15 @@ def _serve(options: argparse.Namespace) -> int:
     if options.record is not None:
         cli.require_new_path(options.record)
     goals = None if options.goals is None else read_named_goals(options.goals)
-    ended = serve(lambda: _loaded(options, goals), access, options.port, cli.show)
-    if not ended:  # the planning thread still searches or loads; its result is not needed, so do not wait for it
+    has_ended = serve(lambda: _load_session(options, goals), access, options.port, cli.show)
+    if not has_ended:  # the planning thread still runs; its result is not needed, so do not wait for it
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(0)
     return 0
 
 
-def _loaded(options: argparse.Namespace, goals: NamedGoals | None) -> tuple[Session, Mapping[str, Any]]:
+def _load_session(options: argparse.Namespace, goals: NamedGoals | None) -> tuple[Session, Mapping[str, Any]]:
     """Load the model and make a first decision; return the session and the metadata for clients."""
     from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.planning.controller import Controller
@@ -154,8 +155,10 @@ def _loaded(options: argparse.Namespace, goals: NamedGoals | None) -> tuple[Sess
     from vjepa2_ac.serving.session import Session, SessionOptions
 
     loaded = cli.load_planning_session(options)
-    steps = require_stride(loaded.config.data, to="say how long an action lasts", fix="Say which, as data.stride=4")
-    how = SessionOptions(
+    steps = require_stride(
+        loaded.config.data, to="compute the duration of an action", fix="Set it, for example data.stride=4"
+    )
+    session_options = SessionOptions(
         options.actions,
         control_steps=steps,
         image_keys=IMAGE_KEYS if options.image_key is None else (options.image_key,),
@@ -166,7 +169,7 @@ def _loaded(options: argparse.Namespace, goals: NamedGoals | None) -> tuple[Sess
     controller = Controller.of_subject(loaded, extrinsics=options.extrinsics)
     for sequence in (goals or {}).values():
         require_goal_ends(sequence, first=1)
-    session = Session(controller, goals or {}, how)
+    session = Session(controller, goals or {}, session_options)
     about = make_metadata(loaded, session)
     Work.begin("the first decision")
     cli.show(describe_server(about, options.subject), f"a first decision took {warm_up(controller):.1f} s")
@@ -185,14 +188,14 @@ def _simulate(options: argparse.Namespace) -> int:
     FOLDER` records demonstrations of the arm as a DROID data set instead.
     """
     if options.world is not None:
-        _refuse(options, ("task", "domain"), needed="none: the world has its own")
-        _refuse(options, ("manifest",), needed="the simulated arm: --seed determines the problems of a world")
+        _require_unset(options, ("task", "domain"), problem="--world, which defines task and scene itself")
+        _require_unset(options, ("manifest",), problem="--world, whose problems are determined by --seed")
     elif options.world_timeout is not None:
-        raise InputError(where="--world-timeout", found="no --world", needed="the program that it applies to")
+        raise InputError(where="--world-timeout", found="no --world", needed="--world COMMAND, whose answers it limits")
     if options.subject == "record":
-        _refuse(options, _OF_A_MODEL, needed="a model that steers")
+        _require_unset(options, _MODEL_OPTIONS, problem="`simulate record`, which uses no model")
         return _record(options)
-    _refuse(options, _OF_RECORD, needed="`simulate record FOLDER`")
+    _require_unset(options, _RECORD_OPTIONS, problem="a model, but the option is for `simulate record FOLDER`")
     return _run_benchmark(options)
 
 
@@ -203,7 +206,7 @@ def _record(options: argparse.Namespace) -> int:
     try:
         target = cli.as_path(options.overrides[0])
     except argparse.ArgumentTypeError as error:
-        raise InputError(where="simulate record", found=str(error), needed="a folder of this machine") from None
+        raise InputError(where="simulate record", found=str(error), needed="a local folder") from None
     if options.world is not None:
         return _record_world(options, target)
     cli.require_new_path(target)
@@ -211,9 +214,9 @@ def _record(options: argparse.Namespace) -> int:
     from vjepa2_ac.simulation.record import RecordingSpec, default_steps, record_dataset
 
     task = None if options.task == "reach" else options.task
-    spec = cli.record_of_options(RecordingSpec, options, task=task, steps=options.steps or default_steps(task))
+    spec = cli.make_record(RecordingSpec, options, task=task, steps=options.steps or default_steps(task))
     episodes, workers = options.episodes or 40, options.workers or 1
-    with cli.reporter() as reporter:
+    with cli.make_reporter() as reporter:
         progress = reporter.task("recording")
         progress(0, episodes)
         folder = record_dataset(target, spec, episodes=episodes, workers=workers, progress=progress)
@@ -222,15 +225,15 @@ def _record(options: argparse.Namespace) -> int:
 
 
 def _record_world(options: argparse.Namespace, target: Path) -> int:
-    _refuse(options, _OF_RECORD, needed="the simulated arm: a world has one camera, and one process")
+    _require_unset(options, _RECORD_OPTIONS, problem="--world, which uses one camera and one process")
 
     from vjepa2_ac.simulation.worlds import ExternalEnvironment, record_world
 
-    with ExternalEnvironment(options.world, options.world_timeout) as world, cli.reporter() as reporter:
+    with ExternalEnvironment(options.world, options.world_timeout) as world, cli.make_reporter() as reporter:
         seeds = range(options.seed or 0, (options.seed or 0) + (options.episodes or 40))
         solved, shown = record_world(world, target, seeds, reporter.task("recording"))
-    done = f"the expert solved {solved} of {shown}, the others are random exploration"
-    cli.show(f"{counted(len(seeds), 'episode')} in {target}; {done}. Next: {shell_command('init', target)}")
+    content = f"the expert solved {solved} of {shown}, the remaining episodes are random exploration"
+    cli.show(f"{counted(len(seeds), 'episode')} in {target}; {content}. Next: {shell_command('init', target)}")
     return 0
 
 
@@ -256,21 +259,23 @@ def _run_benchmark(options: argparse.Namespace) -> int:
         subject = benchmark.subject
         title = f"{subject.name}: checkpoint {subject.checkpoint_label}" if subject.checkpoint_label else subject.name
         cli.show(title, benchmark_table(benchmark), files=files)
-    summary = _summary(benchmark, verdict, options)
-    cli.show(*benchmark_notes(benchmark), str(summary), *_next(summary, verdict, options))
+    summary = _make_summary(benchmark, verdict, options)
+    cli.show(*benchmark_notes(benchmark), str(summary), *_recommend_next(summary, verdict, options))
     cli.show(*(f"Video: {file}" for file in files[1:2]))
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
 
 
 def _require_benchmark(options: argparse.Namespace) -> None:
-    """Check that the options fit together and that the run or model exists.
+    """Check that the domain can be used for a model and that the run or model exists.
 
     Raises:
-        InputError: They do not, or it does not exist.
+        InputError: The domain is for recording only, or the run or model does not exist.
     """
     if options.domain == "random":
-        raise InputError(where="--domain random", found="a model that steers", needed="A or B")
-    cli.require_to_plan(options)
+        raise InputError(
+            where="--domain random", found="a model", needed="A or B, because random is for `simulate record`"
+        )
+    cli.read_planning_config(options)
 
 
 def _measure(options: argparse.Namespace, manifest: Manifest | None) -> tuple[ClosedLoopBenchmark, Path]:
@@ -279,30 +284,30 @@ def _measure(options: argparse.Namespace, manifest: Manifest | None) -> tuple[Cl
     from vjepa2_ac.simulation.domains import load_mujoco
     from vjepa2_ac.simulation.worlds import ExternalEnvironment, run_world_benchmark
 
-    chosen = cli.record_of_options(BenchmarkOptions, options)
-    chosen = replace(chosen, films=min(chosen.films, chosen.episodes))
+    request = cli.make_record(BenchmarkOptions, options)
+    request = replace(request, films=min(request.films, request.episodes))
     if manifest is not None:
-        chosen = manifest.options(chosen.films)
-    name = f"{chosen.task}-{chosen.world.name}"
+        request = manifest.options(request.films)
+    name = f"{request.task}-{request.world.name}"
     with contextlib.ExitStack() as stack:
         if options.world is None:
             load_mujoco()
         else:
             env = stack.enter_context(ExternalEnvironment(options.world, options.world_timeout))
             name = re.sub(r"\W+", "-", f"{env.about.task} {env.about.world}", flags=re.ASCII).strip("-")[:200]
-        subject, reporter = cli.load_planning_session(options), stack.enter_context(cli.reporter())
+        subject, reporter = cli.load_planning_session(options), stack.enter_context(cli.make_reporter())
         require_measured_inputs(subject, world=options.world is not None)
         home = Path(options.subject) if is_run(options.subject) else Path()
         folder = options.out or home / "closed_loop" / name
         cli.make_folder(folder)
         if options.world is not None:
-            return run_world_benchmark(subject, env, chosen, reporter), folder
+            return run_world_benchmark(subject, env, request, reporter), folder
         if manifest is not None:
             manifest.require_stride(subject.config.data.model_stride)
             subject = replace(subject, config=subject.config.model_copy(update={"seed": manifest.planning_seed}))
         elif options.manifest is not None:
-            _write_manifest(options.manifest, chosen, subject)
-        return run_benchmark(subject, chosen, reporter), folder
+            _write_manifest(options.manifest, request, subject)
+        return run_benchmark(subject, request, reporter), folder
 
 
 def _read_manifest(options: argparse.Namespace) -> Manifest | None:
@@ -316,7 +321,7 @@ def _read_manifest(options: argparse.Namespace) -> Manifest | None:
     from vjepa2_ac.simulation.manifest import read_manifest
 
     manifest = read_manifest(options.manifest)
-    words = [f"--{name.replace('_', '-')}" for name in _OF_A_MANIFEST if getattr(options, name) is not None]
+    words = [f"--{name.replace('_', '-')}" for name in _MANIFEST_OPTIONS if getattr(options, name) is not None]
     keys = {f"planning.{key}" for key in manifest.planning}
     words += [word for word in options.overrides if ".".join(word.partition("=")[0].split(".")[:2]) in keys]
     if words:
@@ -326,14 +331,14 @@ def _read_manifest(options: argparse.Namespace) -> Manifest | None:
     return manifest
 
 
-def _write_manifest(path: Path, chosen: BenchmarkOptions, subject: Subject) -> None:
+def _write_manifest(path: Path, request: BenchmarkOptions, subject: Subject) -> None:
     from vjepa2_ac.simulation.manifest import Manifest
 
-    Manifest.of(chosen, subject).write(path)
-    cli.show(f"Manifest: {path}. Others repeat this measurement with --manifest {path}")
+    Manifest.of(request, subject).write(path)
+    cli.show(f"Manifest: {path}. To repeat this measurement, pass --manifest {path}")
 
 
-def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse.Namespace) -> Summary:
+def _make_summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse.Namespace) -> Summary:
     """Return a summary of the closed-loop verdict and, if `evaluate` measured this checkpoint, its other verdicts."""
     from vjepa2_ac.evaluation.summary import PREDICTION, RANKING, SENSITIVITY, Summary, not_measured_verdict
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
@@ -348,20 +353,20 @@ def _summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse
     if subject.checkpoint_label and (Path(subject.name) / METRICS_FILE).is_file():
         with contextlib.suppress(InputError):  # metrics.json has an older format: keep "not measured"
             evaluated = read_metrics(Path(subject.name))
-            # Only the names are compared, because older files describe the selection in other words.
+            # The text after the name differs between versions of metrics.json, so only the names are compared.
             names = {text.partition(" ")[0] for text in (evaluated.about.checkpoint, subject.checkpoint_label)}
             if len(names) == 1:
                 summary = replace(evaluated.summary, measured=measured, planning=verdict)
     return summary
 
 
-def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> list[str]:
+def _recommend_next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> list[str]:
     """Return a line with the recommended next command; empty if there is none."""
     is_evaluated, command = summary.prediction.value is not None, _evaluate_command(options)
-    if verdict.needs or options.sub_goals is not None:  # the verdict names the fix; a server plans without sub-goals
+    if verdict.needs or options.sub_goals is not None:  # the verdict states the fix; a server plans without sub-goals
         return []
     if verdict.conclusion == "yes" and (is_evaluated or not command):
-        words = cli.option_words(options, "checkpoint", "config", "plugin")
+        words = cli.make_option_words(options, "checkpoint", "config", "plugin")
         command = shell_command("serve", options.subject, *words, *options.overrides)
     elif command and is_evaluated:
         if any(map(sets_movable_path, options.overrides)):  # `data calibrate` needs the base model at its original path
@@ -372,22 +377,22 @@ def _next(summary: Summary, verdict: Verdict, options: argparse.Namespace) -> li
 
 def _evaluate_command(options: argparse.Namespace) -> str:
     """Return the `evaluate` command for the tested run; empty for a model, because its data are not known."""
-    words = [*cli.option_words(options, "checkpoint", "plugin"), *filter(sets_movable_path, options.overrides)]
+    words = [*cli.make_option_words(options, "checkpoint", "plugin"), *filter(sets_movable_path, options.overrides)]
     return shell_command("evaluate", options.subject, *words) if is_run(options.subject) else ""
 
 
-def _refuse(options: argparse.Namespace, names: Sequence[str], *, needed: str) -> None:
+def _require_unset(options: argparse.Namespace, names: Sequence[str], *, problem: str) -> None:
     """Check that options without an effect in this mode are not set.
 
     Args:
         options: Parsed arguments.
         names: Names of the options that have no effect.
-        needed: What they need, for the error.
+        problem: Why they have no effect, for the error.
 
     Raises:
-        InputError: One of them is set.
+        InputError: One of the options is set.
     """
     for name in names:
         if getattr(options, name) is not None:
-            shown = f"--{name.replace('_', '-')}"
-            raise InputError(where=shown, found=f"simulate {options.subject}", needed=needed)
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(where=option, found=f"used with {problem}", fix=f"Omit {option}")

@@ -13,7 +13,7 @@ from vjepa2_ac.errors import InputError, counted, shell_command
 from vjepa2_ac.reporter import INDEXING, SILENT
 from vjepa2_ac.storage.structured import format_json, to_plain
 
-_CLIPS, _PAIRS = 64, 200  # for the calibration of strides and of axes; 200 pairs as in the paper
+_NUM_CLIPS, _NUM_PAIRS = 64, 200  # defaults of --limit for strides and for axes; 200 pairs as in the paper
 
 
 def add_data(commands: cli.Commands) -> None:
@@ -26,20 +26,20 @@ def add_data(commands: cli.Commands) -> None:
 def _add_commands(commands: cli.Commands) -> None:
     such_as, out = "data.camera=wrist_left", Path("inspection")
 
-    parser = cli.command(commands, "check", _check, "my_robot.yaml")
+    parser = cli.add_command(commands, "check", _check, "my_robot.yaml")
     cli.add_config(parser, such_as=such_as)
     cli.add(parser, "--limit N", "number of clips to load (32); --model uses twice as many", cli.count, default=32)
     text = "also measure with a model whether frames are shifted, mirrored, reversed or BGR, or the gripper is inverted"
     cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
     cli.add(parser, "--json", "print one JSON object: the findings and their counts", action="store_true")
 
-    parser = cli.command(commands, "inspect", _inspect, "my_robot.yaml --out inspection")
+    parser = cli.add_command(commands, "inspect", _inspect, "my_robot.yaml --out inspection")
     cli.add_config(parser, such_as=such_as)
     cli.add(parser, "--out DIR", "output folder (inspection)", cli.as_path, default=out)
     cli.add(parser, "--episodes --limit N", "episodes whose motion is analysed (100)", cli.count, default=100)
     cli.add(parser, "--rows N", "episodes on the contact sheet (8)", cli.count, default=8)
 
-    parser = cli.command(commands, "calibrate", _calibrate, "my_robot.yaml --limit 64")
+    parser = cli.add_command(commands, "calibrate", _calibrate, "my_robot.yaml --limit 64")
     cli.add_config(parser, such_as=such_as)
     cli.add(
         parser,
@@ -47,18 +47,24 @@ def _add_commands(commands: cli.Commands) -> None:
         "measure the angle between this model's axes and the robot's axes; writes axes.json",
         cli.as_model,
     )
-    cli.add(parser, "--model MODEL", "the model to measure: a .pt, a folder, or a run (model.base)", cli.as_model)
-    cli.add(parser, "--split", "of which (validation)", choices=["train", "validation", "test"], default="validation")
+    cli.add(parser, "--model MODEL", "the model to measure: a .pt file, a folder, or a run (model.base)", cli.as_model)
+    cli.add(
+        parser,
+        "--split",
+        "episodes to measure (validation)",
+        choices=["train", "validation", "test"],
+        default="validation",
+    )
     cli.add(parser, "--limit N", "clips for each stride (64); with --axes: pairs of frames (200)", cli.count)
     cli.add(parser, "--out DIR", "output folder (inspection)", cli.as_path, default=out)
 
-    parser = cli.command(commands, "convert", _convert, "my_robot.yaml data/as_lerobot")
+    parser = cli.add_command(commands, "convert", _convert, "my_robot.yaml data/as_lerobot")
     cli.add(parser, "config CONFIG", "a YAML config", cli.as_local)
     cli.add(parser, "out OUT", "a new or empty folder", cli.as_path)
-    cli.add(parser, "overrides key=value", f"such as {such_as}", nargs="*")
+    cli.add_overrides(parser, f"such as {such_as}")
 
-    parser = cli.command(commands, "converter", _converter, "mp4_and_csv > mp4_and_csv.py")
-    cli.add(parser, "name NAME", "which script", nargs="?")
+    parser = cli.add_command(commands, "converter", _converter, "mp4_and_csv > mp4_and_csv.py")
+    cli.add(parser, "name NAME", "the script to print", nargs="?")
 
 
 def _convert(options: argparse.Namespace) -> None:
@@ -73,7 +79,7 @@ def _convert(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.data.convert import convert_to_lerobot
 
-    with cli.reporter() as reporter:
+    with cli.make_reporter() as reporter:
         episodes, steps = convert_to_lerobot(config.data, options.out, reporter)
     written = f"{counted(episodes, 'episode')}, {counted(steps, 'step')}."
     cli.show(f"{written} Next: {shell_command('init', options.out)}", files=[options.out])
@@ -130,7 +136,7 @@ def check_and_print(config: Config, *, clips: int = 32, model: str | None = None
             print_finding(finding)
 
     batch_size, probe = config.training.batch_size, None
-    with contextlib.nullcontext(SILENT) if as_json else cli.reporter() as reporter:
+    with contextlib.nullcontext(SILENT) if as_json else cli.make_reporter() as reporter:
         progress = reporter.task(INDEXING)
         for finding in check_data(config.data, seed=config.seed, batch_size=batch_size, clips=clips, progress=progress):
             add(finding)
@@ -158,7 +164,7 @@ def _inspect(options: argparse.Namespace) -> None:
     from vjepa2_ac.inspection.sheet import plot_dataset
     from vjepa2_ac.inspection.statistics import inspect_dataset, with_numeric_stride
 
-    with cli.reporter() as reporter:
+    with cli.make_reporter() as reporter:
         dataset = with_numeric_stride(cli.open_data(config, reporter))
         if config.data.stride == "auto":
             reporter.note(f"data.stride is auto: inspected at the smallest candidate, {dataset.config.stride}")
@@ -187,8 +193,8 @@ def _calibrate(options: argparse.Namespace) -> int:
     from vjepa2_ac.evaluation.measure import ClipSample
     from vjepa2_ac.inspection.variants import calibrate_config
 
-    with cli.reporter() as reporter:
-        sample = ClipSample(options.split, options.limit or _CLIPS)
+    with cli.make_reporter() as reporter:
+        sample = ClipSample(options.split, options.limit or _NUM_CLIPS)
         calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
     path = cli.write_json(options.out / "calibration.json", calibration.as_dict())
     title = f"One-step error relative to persistence, {options.split} clips of {calibration.frames} frames"
@@ -211,8 +217,8 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
 
     from vjepa2_ac.inspection.axes import calibrate_axes
 
-    with cli.reporter() as reporter:
-        pairs = options.limit or _PAIRS
+    with cli.make_reporter() as reporter:
+        pairs = options.limit or _NUM_PAIRS
         fit, content = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
     cli.show(fit.words(), files=[cli.write_json(options.out / AXES_FILE, content)])
     return int(fit.problem is not None)

@@ -13,19 +13,20 @@ from vjepa2_ac.process import is_first_process
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run, sets_movable_path
 
-_NAMED = ("none", "up", "left", "close")  # default actions of `imagine --image`, which has no recorded actions
+_DEFAULT_ACTIONS = ("none", "up", "left", "close")  # of `imagine --image`, which has no recorded actions
 
 if TYPE_CHECKING:
     from vjepa2_ac.decoding.imagine import RolloutComparison
+    from vjepa2_ac.evaluation.imagined import ImagineOptions
     from vjepa2_ac.evaluation.result import About
     from vjepa2_ac.reports.write import WrittenEvaluation
 
 
 def add_evaluate(commands: cli.Commands) -> None:
     """Add `evaluate` to a parser."""
-    parser = cli.command(commands, "evaluate", _evaluate, "demo/run --clips 64 --decoder demo/decoder")
+    parser = cli.add_command(commands, "evaluate", _evaluate, "demo/run --clips 64 --decoder demo/decoder")
     cli.add(parser, "subject RUN_OR_MODEL", "a run, or (with --data) a value of model.base", cli.as_model)
-    cli.add(parser, "overrides key=value", "model.base=PATH, if the base model was moved", nargs="*")
+    cli.add_overrides(parser, "model.base=PATH, if the base model was moved")
     cli.add(
         parser,
         "--against base|RUN|MODEL",
@@ -33,15 +34,15 @@ def add_evaluate(commands: cli.Commands) -> None:
         cli.as_model,
         nargs="+",
     )
-    cli.add(parser, "--clips N", "at most this many clips, spread over the episodes (256)", cli.count)
-    cli.add_decoder(parser, "the rollouts as images, and measure these, too")
+    cli.add(parser, "--clips N", "maximum number of clips, spread over the episodes (256)", cli.count)
+    cli.add_decoder(parser, "the rollouts as images; their errors are measured")
     cli.add(parser, "--out FOLDER", "output folder (the run's folder)", cli.as_path)
     cli.add_all(parser)
-    group = parser.add_argument_group("data, and what is measured")
-    cli.add(group, "--data CONFIG", "a config: use its data, model.dtype, device and seed", cli.as_local)
+    group = parser.add_argument_group("data")
+    cli.add(group, "--data CONFIG", "a config, whose data, model.dtype, device and seed are used", cli.as_local)
     cli.add(group, "--split", "held-out episodes to measure (test)", choices=["test", "validation"])
     cli.add_checkpoint(group)
-    group = parser.add_argument_group("use of the actions")
+    group = parser.add_argument_group("sensitivity to actions")
     cli.add(group, "--ranking-clips N", "clips for the action-ranking error (32)", cli.whole_number(0))
     cli.add(group, "--samples N", "alternative actions for each clip (64)", cli.count)
     cli.add(group, "--landscapes N", "clips with an energy landscape (8)", cli.whole_number(0), dest="landscape_clips")
@@ -54,12 +55,12 @@ def add_evaluate(commands: cli.Commands) -> None:
         dest="reach_cm",
     )
     cli.add(group, "--examples N", "example clips in the report (4)", cli.whole_number(0))
-    cli.add(group, "--at-once N", "actions computed together (64): lower it to save memory", cli.count)
+    cli.add(group, "--at-once N", "actions in one batch (64); a smaller batch needs less memory", cli.count)
 
 
 def add_compare(commands: cli.Commands) -> None:
     """Add `compare` to a parser."""
-    parser = cli.command(commands, "compare", _compare, "runs/lora runs/full --out comparison.png")
+    parser = cli.add_command(commands, "compare", _compare, "runs/lora runs/full --out comparison.png")
     cli.add(parser, "runs RUN", "folders with a metrics.json, two or more", cli.as_path, nargs="+")
     cli.add(parser, "--out PNG", "the image (comparison.png)", cli.as_path, default=Path("comparison.png"))
     cli.add_all(parser)
@@ -67,11 +68,11 @@ def add_compare(commands: cli.Commands) -> None:
 
 def add_imagine(commands: cli.Commands) -> None:
     """Add `imagine` to a parser."""
-    parser = cli.command(commands, "imagine", _imagine, "demo/run --decoder demo/decoder --actions true,up,left")
-    cli.add_planner(parser, such_as="such as model.base=PATH; with --image: planning.limits.xyz=data")
+    parser = cli.add_command(commands, "imagine", _imagine, "demo/run --decoder demo/decoder --actions true,up,left")
+    cli.add_planner(parser, "such as model.base=PATH; with --image: planning.limits.xyz=data")
     cli.add_decoder(parser, "the predicted frames", required=True)
-    text = "true (as recorded), none, up, down, left, right, forward, back, open, close, with commas between them; or"
-    text += " files, .npy or .csv, with a row of 7 numbers for each step (true,none,up,left,close)"
+    text = "separated by commas: true (the recorded actions), none, up, down, left, right, forward, back, open, close,"
+    text += " or .npy and .csv files with 7 numbers for each step (true,none,up,left,close)"
     cli.add(parser, "--actions NAMES", text, _names)
     cli.add(parser, "--steps N", "number of model steps (7)", cli.count, default=7)
     cli.add(
@@ -82,14 +83,14 @@ def add_imagine(commands: cli.Commands) -> None:
     cli.add(group, "--episode ID", "name of the episode, or a part of it (the episode with the most motion)")
     cli.add(group, "--start N", "first control step of the clip (0)", cli.whole_number(0))
     cli.add(group, "--split", "episodes to use (test)", choices=["test", "validation", "train"], default="test")
-    cli.add(group, "--data CONFIG", "a config: use its data; required for a model", cli.as_local)
+    cli.add(group, "--data CONFIG", "a config, whose data are used; required for a model", cli.as_local)
     group = parser.add_argument_group("instead of a clip")
-    cli.add(group, "--image IMAGE", "a camera image: PNG or JPEG; then actions are names only", cli.as_local)
+    cli.add(group, "--image IMAGE", "a camera image (PNG or JPEG); `--actions true` needs a clip", cli.as_local)
     cli.add(group, "--state NUMBERS", "the measured state, as for `plan --state`", cli.as_numbers)
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    """Measure a run or a model on held-out episodes: is it better?
+    """Measure the errors of a run or model on held-out episodes.
 
     The predictions are compared with those of the base model, with persistence, and with predictions for wrong actions.
     """
@@ -100,9 +101,9 @@ def _evaluate(options: argparse.Namespace) -> None:
         needed = "one run or model, and model.base=PATH if its base model was moved"
         fix = "For a second run use --against RUN, or call evaluate again. Other config keys cannot be changed"
         raise InputError(where="command line", found=" ".join(unused), needed=needed, fix=fix)
-    request = cli.evaluation_options(options, probes=cli.record_of_options(ProbeOptions, options))
+    request = cli.make_evaluation_options(options, probes=cli.make_record(ProbeOptions, options))
     cli.require_subject(subject, resolve_config(subject, request), options.words)
-    cli.report_relocated_paths(subject)
+    cli.report_remote_urls(subject)
 
     from vjepa2_ac.cli.tables import row_tables
     from vjepa2_ac.distributed import leave_processes
@@ -110,9 +111,9 @@ def _evaluate(options: argparse.Namespace) -> None:
     from vjepa2_ac.evaluation.rows import make_rows
     from vjepa2_ac.reports.write import write_evaluation
 
-    with cli.reporter() as reporter:
+    with cli.make_reporter() as reporter:
         evaluation = evaluate_subject(subject, request, reporter=reporter if is_first_process() else SILENT)
-        if is_first_process():  # the other processes only share the computation
+        if is_first_process():  # the other processes only take part in the computation
             reporter.task("writing report and figures")
             measured = write_evaluation(evaluation, request.out or Path(subject))
     if is_first_process():
@@ -121,13 +122,13 @@ def _evaluate(options: argparse.Namespace) -> None:
             name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
             tables = row_tables(make_rows(evaluation), "Held-out episodes")
             cli.show(name, *tables, *notes, files=measured.files)
-        cli.show(str(measured.summary), *_next(measured, options))
+        cli.show(str(measured.summary), *_recommend_next(measured, options))
         video = "" if evaluation.decoded is None else "video and "
         cli.show(f"Report with {video}all tables: {measured.report}")
     leave_processes()
 
 
-def _next(measured: WrittenEvaluation, options: argparse.Namespace) -> list[str]:
+def _recommend_next(measured: WrittenEvaluation, options: argparse.Namespace) -> list[str]:
     """Return a line with the recommended next command; empty if there is none."""
     about, summary, settings = measured.evaluation.about, measured.summary, options.overrides
     config = options.data or f"{about.subject}/config.yaml"
@@ -138,16 +139,16 @@ def _next(measured: WrittenEvaluation, options: argparse.Namespace) -> list[str]
     elif not summary.prediction.needs:
         if about.is_base or "no" in {verdict.conclusion for verdict in summary.verdicts[:3]}:
             words += ["--model", about.subject] * (not any(map(sets_movable_path, settings)))
-        elif summary.planning is None and (simulation := _simulation(about, options)):
-            words = simulation
+        elif summary.planning is None and (simulate_words := _make_simulate_words(about, options)):
+            words = simulate_words
         elif summary.verdicts[2].conclusion == "yes":  # `serve` is recommended only after a measured improvement
-            words = ["serve", about.subject, *cli.option_words(options, "checkpoint"), *settings]
+            words = ["serve", about.subject, *cli.make_option_words(options, "checkpoint"), *settings]
         else:
             return []
-    return [f"Next: {shell_command(*words, *cli.option_words(options, 'plugin'))}"]
+    return [f"Next: {shell_command(*words, *cli.make_option_words(options, 'plugin'))}"]
 
 
-def _simulation(about: About, options: argparse.Namespace) -> list[str]:
+def _make_simulate_words(about: About, options: argparse.Namespace) -> list[str]:
     """Return the arguments of the command that tests a run in closed loop; empty unless its data were simulated."""
     from vjepa2_ac.distributed import is_on_cpu
     from vjepa2_ac.planning.settings import load_planning_config
@@ -160,8 +161,16 @@ def _simulation(about: About, options: argparse.Namespace) -> list[str]:
         return []
     task, domain = recorded.task or "reach", recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
     config = load_planning_config(about.subject, overrides=options.overrides)
-    quick = cli.quick_words(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
-    words = ["simulate", about.subject, "--task", task, "--domain", domain, *cli.option_words(options, "checkpoint")]
+    quick = cli.make_quick_overrides(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
+    words = [
+        "simulate",
+        about.subject,
+        "--task",
+        task,
+        "--domain",
+        domain,
+        *cli.make_option_words(options, "checkpoint"),
+    ]
     return [*words, *options.overrides, *quick]
 
 
@@ -187,63 +196,69 @@ def _compare(options: argparse.Namespace) -> None:
 def _imagine(options: argparse.Namespace) -> None:
     """Make a video of a model's predicted frames, for any actions.
 
-    The rollouts start from a frame of a held-out clip, or from an image. For a clip, those with the recorded actions
-    are shown with the true frames and those of the base model. Other actions can be named. For data from `simulate
-    record`, the simulator also shows the true outcome of the other actions. The command writes an image strip, an MP4
-    and a GIF. Decoded frames are no evidence of success (docs/decoding.md).
+    The rollouts start from a frame of a held-out clip, or from an image. For a clip, the rollout with the recorded
+    actions is shown with the true frames and the base model's rollout. Other actions can be named. For data from
+    `simulate record`, the simulator also shows the true outcome of the other actions. The command writes an image
+    strip, an MP4 and a GIF. Decoded frames are no evidence of success (docs/decoding.md).
     """
-    _require_one_start(options)
+    from vjepa2_ac.evaluation.request import resolve_config
 
-    from vjepa2_ac.decoding.imagine import write_rollouts
-
+    _require_valid_start(options)
     home = Path(options.subject) if is_run(options.subject) else Path()
     out = options.out or home / "imagined"
-    with cli.reporter() as reporter:
-        imagination = _of_image(options) if options.image is not None else _of_clip(options, out, reporter)
-        written = write_rollouts(imagination, out, reporter=reporter)
-    cli.show(*imagination.notes, files=written)
+    evaluation = cli.make_evaluation_options(options, out=out)
+    if options.image is not None:
+        cli.read_planning_config(options)
+    else:
+        cli.require_subject(options.subject, resolve_config(options.subject, evaluation), options.words)
+
+    from vjepa2_ac.decoding.imagine import write_rollouts
+    from vjepa2_ac.evaluation.imagined import ImagineOptions, require_actions
+
+    actions = options.actions or (None if options.image is None else _DEFAULT_ACTIONS)
+    values = {"evaluation": evaluation, "size_m": options.size / 100} | ({"actions": actions} if actions else {})
+    request = cli.make_record(ImagineOptions, options, **values)
+    require_actions(request, has_recorded=options.image is None)
+    with cli.make_reporter() as reporter:
+        imagine = _imagine_clip if options.image is None else _imagine_image
+        rollouts = imagine(options, request, reporter)
+        written = write_rollouts(rollouts, out, reporter=reporter)
+    cli.show(*rollouts.notes, files=written)
 
 
-def _require_one_start(options: argparse.Namespace) -> None:
-    """Check that the options name one start: a clip, or an image with its state.
+def _require_valid_start(options: argparse.Namespace) -> None:
+    """Check that the options select one start: a clip, or an image with its state.
 
     Raises:
         InputError: Options are missing or contradict each other.
     """
     if options.start is not None and options.episode is None:
-        raise InputError(where="--start", found="no --episode", needed="the episode whose control step it is")
+        raise InputError(where="--start", found="no --episode", needed="--episode: --start is one of its control steps")
     if (options.image is None) != (options.state is None):
-        raise InputError(where="--image, --state", found="one of them", needed="both: state and image of one moment")
+        raise InputError(where="--image, --state", found="only one of them", needed="both, recorded at the same time")
     clip = {"--episode": options.episode, "--data": options.data}
     if options.image is not None and (used := [name for name, value in clip.items() if value is not None]):
-        raise InputError(where="--image", found=f"{', '.join(used)}, too", needed="a clip or an image, not both")
+        raise InputError(where="--image", found=f"also {', '.join(used)}", needed="a clip or an image, not both")
 
 
-def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> RolloutComparison:
-    from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
-    from vjepa2_ac.evaluation.request import resolve_config
+def _imagine_clip(options: argparse.Namespace, request: ImagineOptions, reporter: Reporter) -> RolloutComparison:
+    from vjepa2_ac.evaluation.imagined import imagine_clip
     from vjepa2_ac.simulation.counterfactual import simulated_outcome
 
-    cli.report_relocated_paths(options.subject)
-    how = {"evaluation": cli.evaluation_options(options, out=out), "size_m": options.size / 100}
-    request = cli.record_of_options(ImagineOptions, options, **how)
-    cli.require_subject(options.subject, resolve_config(options.subject, request.evaluation), options.words)
+    cli.report_remote_urls(options.subject)
     return imagine_clip(options.subject, request, simulate=simulated_outcome, reporter=reporter)
 
 
-def _of_image(options: argparse.Namespace) -> RolloutComparison:
-    from vjepa2_ac.evaluation.imagined import ImageObservation, ImagineOptions, imagine_image
+def _imagine_image(options: argparse.Namespace, request: ImagineOptions, _reporter: Reporter) -> RolloutComparison:
+    from vjepa2_ac.evaluation.imagined import ImageObservation, imagine_image
     from vjepa2_ac.media.images import read_image
 
-    cli.require_to_plan(options)
     observation = ImageObservation(read_image(options.image), options.state, options.extrinsics)
-    named = {"actions": options.actions or _NAMED, "size_m": options.size / 100}
-    request = cli.record_of_options(ImagineOptions, options, **named)
     return imagine_image(cli.load_planning_session(options), request, observation)
 
 
 def _names(text: str) -> tuple[str, ...]:
-    """Parse the value of --actions: names or files with commas between them."""
+    """Parse the value of --actions: names or files, separated by commas."""
     if names := tuple(word for word in text.split(",") if word):
         return names
-    raise argparse.ArgumentTypeError("no actions; give one or more names, with commas between them")
+    raise argparse.ArgumentTypeError("no actions; give one or more names, separated by commas")

@@ -30,12 +30,10 @@ _EPISODES = 8  # number of episodes to simulate for the package's model, which h
 
 def add_explore(commands: cli.Commands) -> None:
     """Add `explore` to a parser."""
-    parser = cli.command(commands, "explore", _explore, "demo/run --against base")
+    parser = cli.add_command(commands, "explore", _explore, "demo/run --against base")
     text = f"a run, or a value of model.base ({_DEMO_RUN} if it exists, otherwise {_BUILTIN_MODEL})"
     cli.add(parser, "subject RUN_OR_MODEL", text, cli.as_model, nargs="?")
-    cli.add(
-        parser, "overrides key=value", "such as planning.samples=200 (on a CPU the default search is short)", nargs="*"
-    )
+    cli.add_overrides(parser, "such as planning.samples=200 (on a CPU the default search is short)")
     cli.add(
         parser,
         "--against base|RUN|MODEL",
@@ -46,11 +44,14 @@ def add_explore(commands: cli.Commands) -> None:
     cli.add(
         parser,
         "--decoder FOLDER",
-        "a decoder from `vjepa2-ac decoder` (the one next to the run, otherwise builtin:sim-tiny)",
+        "a decoder from `vjepa2-ac decoder` (`decoder` next to the run, otherwise builtin:sim-tiny)",
         cli.as_model,
     )
     cli.add(
-        parser, "--data CONFIG", "a config: show its data; required for a model, except builtin:sim-tiny", cli.as_local
+        parser,
+        "--data CONFIG",
+        "a config, whose data are shown; required for a model, except builtin:sim-tiny",
+        cli.as_local,
     )
     cli.add(parser, "--split", "episodes to use (test)", choices=["test", "validation", "train"], default="test")
     cli.add_checkpoint(parser)
@@ -63,18 +64,20 @@ def _explore(options: argparse.Namespace) -> int:
     Press a key to command a motion, and compare the predicted frames with those of the base model and with the true
     frames. Choose a goal to see the energy and to plan (docs/explore.md). The command runs until Ctrl-C.
     """
-    if "=" in (options.subject or "") and not Path(options.subject).exists():  # the subject is omitted: an override
+    if (
+        "=" in (options.subject or "") and not Path(options.subject).exists()
+    ):  # an override, because the subject is omitted
         options.subject, options.overrides = None, [options.subject, *options.overrides]
     subject = options.subject or (_DEMO_RUN if is_run(_DEMO_RUN) else _BUILTIN_MODEL)
     config = read_run_config(Path(subject), options.overrides) if is_run(subject) else None
     cli.require_subject(subject, config, options.words)
-    cli.report_relocated_paths(subject)
-    decoder = _decoder(subject, options)
-    with _data(subject, options) as data:
-        with cli.reporter() as reporter:
-            views = _views(subject, data, decoder, options, reporter)
+    cli.report_remote_urls(subject)
+    decoder = _load_decoder(subject, options)
+    with _open_data(subject, options) as data:
+        with cli.make_reporter() as reporter:
+            views = _open_views(subject, data, decoder, options, reporter)
             episodes = counted(len(views.explorer.episodes), "episode")
-            about = f"{subject}, {episodes}; a step takes {views.step_seconds:.2f} s here"
+            about = f"{subject}, {episodes}; a model step takes {views.step_seconds:.2f} s on this machine"
         _serve(views, options, about)
     return 0
 
@@ -82,23 +85,22 @@ def _explore(options: argparse.Namespace) -> int:
 def _serve(views: Views, options: argparse.Namespace, about: str) -> None:
     from vjepa2_ac.explore.server import serve_page
 
-    def ready(url: str) -> None:
+    def show_url(url: str) -> None:
         Work.begin("")
         cli.show(about, f"The page: {url}   (Ctrl-C ends it)")
 
     with contextlib.suppress(KeyboardInterrupt):
-        serve_page(views, options.port, ready)
+        serve_page(views, options.port, show_url)
 
 
 @contextmanager
-def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
-    """Yield the config of the data to explore.
+def _open_data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
+    """Yield the config of the data to explore; None: the data of the run.
 
-    It is the config of `--data`; or None for the data of a run; or, for the package's model, a config of episodes that
-    are simulated into a temporary folder.
+    Without `--data`, episodes for the package's model are simulated and written to a temporary folder.
 
     Raises:
-        InputError: Another model is given without `--data`.
+        InputError: `--data` is missing for a model that is not part of the package.
     """
     if options.data is not None:
         yield cli.read_config(options.data)
@@ -111,22 +113,22 @@ def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
             Work.begin("recording episodes of the simulated arm")
             path = Path(folder) / "data"
             record_dataset(path, RecordingSpec("A", seed=5), episodes=_EPISODES)
-            shares = ["data.validation_share=0.1", "data.test_share=0.8"]
-            yield load_config(f"{BUILTIN}demo", [f"data.path={path}", f"model.base={subject}", *shares])
+            splits = ["data.validation_share=0.1", "data.test_share=0.8"]
+            yield load_config(f"{BUILTIN}demo", [f"data.path={path}", f"model.base={subject}", *splits])
     else:
-        needed = "--data CONFIG, which names held-out episodes"
+        needed = "--data CONFIG, a config with held-out episodes"
         raise InputError(where=f"explore {subject}", found="a model, which has no data of its own", needed=needed)
 
 
-def _decoder(subject: str, options: argparse.Namespace) -> TrainedDecoder:
-    """Load the decoder of `--decoder`, or else the one in the run's parent folder, or else the package's decoder."""
+def _load_decoder(subject: str, options: argparse.Namespace) -> TrainedDecoder:
+    """Load the decoder: that of `--decoder`, of the run's parent folder, or of the package, whichever exists first."""
     from vjepa2_ac.decoding.decoder import CARD, load_decoder
 
     folder = Path(subject).parent / "decoder"
     return load_decoder(options.decoder or (folder if (folder / CARD).is_file() else _BUILTIN_MODEL))
 
 
-def _views(
+def _open_views(
     subject: str, data: Config | None, decoder: TrainedDecoder, options: argparse.Namespace, reporter: Reporter
 ) -> Views:
     from vjepa2_ac.evaluation.evaluate_run import load_models
@@ -136,7 +138,7 @@ def _views(
     from vjepa2_ac.simulation.counterfactual import SimulatedFutures
 
     require_single_process()
-    request = cli.evaluation_options(options, data=data, out=Path())
+    request = cli.make_evaluation_options(options, data=data, out=Path())
     config = resolve_config(subject, request)
 
     load = partial(load_models, subject, config, request)

@@ -34,32 +34,32 @@ Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 Handler = Callable[[argparse.Namespace], int | None]
 
 QUICK = {"samples": 64, "iterations": 4}  # `planning` keys of a fast search on a CPU; docs/planning.md rates its plans
-QUICK_WORDS = tuple(f"planning.{key}={value}" for key, value in QUICK.items())
-_QUICK_SEQUENCES = 256
-_MOST = 10**9
-_OPTION = re.compile(r"-(?![\d.])")  # but a negative number is a value
+QUICK_OVERRIDES = tuple(f"planning.{key}={value}" for key, value in QUICK.items())
+_QUICK_SEQUENCES = 256  # a search on a CPU with more action sequences takes long
+_MAX_COUNT = 10**9
+_OPTION = re.compile(r"-(?![\d.])")  # a word such as -0.3 is a value, not an option
 _Record = TypeVar("_Record")
 _Number = TypeVar("_Number", int, float)
-_Read = TypeVar("_Read")
+_Value = TypeVar("_Value")
 
 
 class _Help(argparse.HelpFormatter):
-    """A help formatter whose usage line shows only required arguments.
+    """A help formatter whose usage line omits optional options such as `--clips N`.
 
     Paragraphs are wrapped separately. A paragraph with indented lines is not wrapped.
     """
 
     def add_usage(self, usage: Any, actions: Iterable[argparse.Action], groups: Any, prefix: Any = None) -> None:
-        one_of = [action for group in groups if group.required for action in group._group_actions]
-        required = [action for action in actions if action.required or not action.option_strings or action in one_of]
-        super().add_usage(usage, required, groups, prefix)
+        alternatives = [action for group in groups if group.required for action in group._group_actions]
+        shown = [action for action in actions if action.required or not action.option_strings or action in alternatives]
+        super().add_usage(usage, shown, groups, prefix)
 
     def _split_lines(self, text: str, width: int) -> list[str]:
         return textwrap.wrap(text, width, break_on_hyphens=False)  # keeps "vjepa2-ac" on one line
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        parts = text.split("\n\n")
-        filled = (part if "\n  " in part else "\n".join(self._split_lines(part, width)) for part in parts)
+        paragraphs = text.split("\n\n")
+        filled = (text if "\n  " in text else "\n".join(self._split_lines(text, width)) for text in paragraphs)
         return textwrap.indent("\n\n".join(filled), indent)
 
 
@@ -71,8 +71,8 @@ class Parser(argparse.ArgumentParser):
 
     example = ""  # arguments of the example, without the name of the command
 
-    def __init__(self, **how: Any) -> None:
-        super().__init__(**how, formatter_class=_Help, add_help=False)
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs, formatter_class=_Help, add_help=False)
         self.add_argument("-h", "--help", action="help", help=argparse.SUPPRESS)
         self._positionals.title = "arguments"
         self._negative_number_matcher = re.compile(r"^-[\d.]")
@@ -87,13 +87,13 @@ class Parser(argparse.ArgumentParser):
         super().error(printable(message))
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        known = [str(choice) for choice in action.choices or ()]
-        if known and str(value) not in known:
-            hint = did_you_mean(str(value), known) or f"Known are {', '.join(known)}"
+        choices = [str(choice) for choice in action.choices or ()]
+        if choices and str(value) not in choices:
+            hint = did_you_mean(str(value), choices) or f"Choices: {', '.join(choices)}"
             raise argparse.ArgumentError(action, f"{value!r} is unknown. {hint.rstrip()}")
 
 
-def command(commands: Commands, name: str, handler: Handler, example: str = "") -> Parser:
+def add_command(commands: Commands, name: str, handler: Handler, example: str = "") -> Parser:
     """Add a command and return its parser.
 
     Args:
@@ -113,54 +113,65 @@ def command(commands: Commands, name: str, handler: Handler, example: str = "") 
 
 
 def add_commands(parser: Parser, groups: Mapping[str, Sequence[Callable[[Commands], None]]]) -> None:
-    """Add groups of commands to a parser. Its help lists them, one per line; without a command the help is printed.
+    """Add groups of commands to a parser. The help lists one command per line, and is printed if no command is given.
 
     Args:
         parser: The parser to extend.
         groups: For each group title, functions that add commands.
     """
 
-    def no_command(_options: argparse.Namespace) -> int:
+    def print_help(_options: argparse.Namespace) -> int:
         parser.print_help()
         return 2
 
     commands = parser.add_subparsers(metavar="COMMAND", help=argparse.SUPPRESS)
     for title, adders in groups.items():
-        before = len(commands.choices)
+        num_before = len(commands.choices)
         for add_to in adders:
             add_to(commands)
-        added = list(commands.choices.items())[before:]
+        added = list(commands.choices.items())[num_before:]
         lines = [f"  {name:<9} {(subparser.description or ' ').splitlines()[0]}" for name, subparser in added]
         if lines:
             parser.description = "\n".join([f"{parser.description}\n\n{title}:", *lines])
     parser.usage = f"{parser.prog} COMMAND ..."
-    parser.set_defaults(handler=no_command, parser=parser, plugin=[])
+    parser.set_defaults(handler=print_help, parser=parser, plugin=[])
 
 
 def add(
-    parser: argparse._ActionsContainer, words: str, text: str, read: Callable[[str], Any] | None = None, **how: Any
+    parser: argparse._ActionsContainer, spec: str, text: str, read: Callable[[str], Any] | None = None, **kwargs: Any
 ) -> None:
     """Add an argument to a parser.
 
     Args:
         parser: A parser or an argument group.
-        words: The name or option names, then the placeholder of the value: "config CONFIG", "--clips N".
-        text: The help text. It states the default, also for options whose parsed default is None because a dataclass
-            defines the default.
+        spec: The name or option names, then the placeholder of the value: "config CONFIG", "--clips N".
+        text: The help text. It states the default. If a dataclass defines the default, the parsed value is None.
         read: Converts the text of a value.
-        how: Keyword arguments of `argparse.ArgumentParser.add_argument`.
+        kwargs: Keyword arguments of `argparse.ArgumentParser.add_argument`.
     """
-    first, *rest = words.split()
+    first, *rest = spec.split()
     names = [first, *(word for word in rest if word.startswith("--"))]
     metavar = next((word for word in rest if word not in names), None)
-    how |= {name: value for name, value in (("type", read), ("metavar", metavar)) if value is not None}
-    parser.add_argument(*names, help=text, **how)
+    kwargs |= {name: value for name, value in (("type", read), ("metavar", metavar)) if value is not None}
+    parser.add_argument(*names, help=text, **kwargs)
 
 
-def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a YAML config", **how: Any) -> None:
-    """Add the argument for a config file and the `key=value` arguments that override its keys."""
-    add(parser, "config CONFIG", what, as_config, **how)
-    add(parser, "overrides key=value", f"such as {such_as} (all keys: `vjepa2-ac config schema`)", nargs="*")
+def add_overrides(parser: argparse.ArgumentParser, text: str) -> None:
+    """Add the `key=value` arguments, which override keys of a config."""
+    add(parser, "overrides key=value", text, nargs="*", default=[])  # without a default, argparse requires one value
+
+
+def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a YAML config", **kwargs: Any) -> None:
+    """Add the argument for a config file and the `key=value` arguments that override its keys.
+
+    Args:
+        parser: The parser.
+        such_as: An override that the help shows as an example.
+        what: The help text of the config argument.
+        kwargs: Keyword arguments of `argparse.ArgumentParser.add_argument`, for the config argument.
+    """
+    add(parser, "config CONFIG", what, as_config, **kwargs)
+    add_overrides(parser, f"such as {such_as} (all keys: `vjepa2-ac config schema`)")
 
 
 def add_checkpoint(parser: argparse._ActionsContainer, default: str | None = "selected") -> None:
@@ -168,19 +179,24 @@ def add_checkpoint(parser: argparse._ActionsContainer, default: str | None = "se
     add(
         parser,
         "--checkpoint STEP",
-        "a step, or best, newest, selected (the best, otherwise the newest)",
+        "a step number, best, newest, or selected: the best, otherwise the newest (selected)",
         default=default,
     )
 
 
-def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
+def add_planner(parser: argparse.ArgumentParser, overrides_help: str) -> None:
     """Add the arguments of `load_planning_session`: run or model, overrides, checkpoint, config and extrinsics."""
     add(parser, "subject RUN_OR_MODEL", "folder of a run, or a value of model.base", as_model)
-    add(parser, "overrides key=value", such_as, nargs="*")
+    add_overrides(parser, overrides_help)
     group = parser.add_argument_group("the model")
     add_checkpoint(group)
     add(group, "--config CONFIG", "for a model: the config with planning, crop and dtype", as_local)
-    add(group, "--extrinsics NUMBERS", "the camera's pose x,y,z,roll,pitch,yaw, if the model uses it", _camera_pose)
+    add(
+        group,
+        "--extrinsics NUMBERS",
+        "the camera's pose x,y,z (m), roll,pitch,yaw (radians), if the model uses it",
+        _camera_pose,
+    )
 
 
 def add_all(parser: argparse._ActionsContainer) -> None:
@@ -188,35 +204,30 @@ def add_all(parser: argparse._ActionsContainer) -> None:
     add(parser, "--all", "also print every table and the names of the written files", action="store_true")
 
 
-def add_decoder(parser: argparse._ActionsContainer, shows: str, **how: Any) -> None:
-    """Add `--decoder`, the decoder that converts latents into images."""
-    add(
-        parser,
-        "--decoder FOLDER",
-        f"show {shows} with a decoder from `vjepa2-ac decoder`, or builtin:sim-tiny",
-        as_model,
-        **how,
-    )
+def add_decoder(parser: argparse._ActionsContainer, use: str, **kwargs: Any) -> None:
+    """Add `--decoder`, the decoder that converts latents into images; `use` completes "which shows" in the help."""
+    text = f"a decoder from `vjepa2-ac decoder`, or builtin:sim-tiny, which shows {use}"
+    add(parser, "--decoder FOLDER", text, as_model, **kwargs)
 
 
-def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace, **more: Any) -> _Record:
-    """Create a dataclass from the options that have the names of its fields and are set; `more` fields override them.
+def make_record(kind: Callable[..., _Record], options: argparse.Namespace, **more: Any) -> _Record:
+    """Create a dataclass from parsed options: an option that is set fills the field with the same name.
 
     Args:
         kind: The dataclass.
         options: Parsed arguments.
-        more: Further field values.
+        more: Values of further fields. They take precedence over options.
     """
     values = {field.name: getattr(options, field.name, None) for field in fields(kind)}  # type: ignore[arg-type]
     return kind(**{name: value for name, value in values.items() if value is not None} | more)
 
 
-def evaluation_options(options: argparse.Namespace, **more: Any) -> EvaluationOptions:
-    """Create the options of an evaluation from parsed arguments, with the config of `--data`; `more` overrides them."""
+def make_evaluation_options(options: argparse.Namespace, **more: Any) -> EvaluationOptions:
+    """Create the options of an evaluation from parsed arguments and the config of `--data`; `more` takes precedence."""
     from vjepa2_ac.evaluation.request import EvaluationOptions
 
     data = read_config(options.data) if options.data else None
-    return record_of_options(EvaluationOptions, options, **({"data": data} | more))
+    return make_record(EvaluationOptions, options, **({"data": data} | more))
 
 
 def show(*parts: Any, files: Iterable[str | Path] = ()) -> None:
@@ -226,14 +237,14 @@ def show(*parts: Any, files: Iterable[str | Path] = ()) -> None:
     show(*parts, files=files)
 
 
-def reporter() -> ConsoleReporter:
+def make_reporter() -> ConsoleReporter:
     """Return a reporter that prints messages and progress to the console."""
     from vjepa2_ac.cli.progress import ConsoleReporter
 
     return ConsoleReporter()
 
 
-def report_relocated_paths(subject: str) -> None:
+def report_remote_urls(subject: str) -> None:
     """Print the remote URLs in the config of a run, before any of them is contacted; print nothing for a model."""
     if is_run(subject) and is_first_process():
         for url in list_remote_locations(read_run_config(Path(subject))):
@@ -248,7 +259,7 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
     Args:
         path: The YAML file.
         overrides: Changed keys, such as training.steps=100.
-        base: Whether to check that `model.base` and `model.encoder` exist, too.
+        base: Whether to check also that `model.base` and `model.encoder` exist.
         of_run: Whether the file is the config of a run.
 
     Raises:
@@ -260,7 +271,7 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
     data = config.data.path
     if not paths.is_url(data) and not Path(data).exists():
         problem = f"no such file or folder, working directory {Path.cwd()}"
-        fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
+        fix = "Set data.path to the data set; docs/QUICKSTART.md explains how to get DROID"
         raise InputError(where=f"data.path: {data}", found=problem, needed="a data set", fix=fix)
     if base:
         require_model(config.model)
@@ -286,8 +297,8 @@ def require_subject(subject: str, config: Config | None = None, command: Sequenc
         read_sizes(base)
 
 
-def require_to_plan(options: argparse.Namespace) -> Config:
-    """Return the config to plan with, and check it and the model's files before the slow import of PyTorch.
+def read_planning_config(options: argparse.Namespace) -> Config:
+    """Read the config for planning, and check that the run or model exists, before the slow import of PyTorch.
 
     Raises:
         InputError: An override or option is invalid, or the run or model does not exist.
@@ -300,12 +311,12 @@ def require_to_plan(options: argparse.Namespace) -> Config:
 
 
 def load_planning_session(options: argparse.Namespace) -> Subject:
-    """Load the run or model that plans, with the options that `require_to_plan` has checked."""
+    """Load the run or model that plans, with the options that `read_planning_config` has checked."""
     from vjepa2_ac.planning.model_setup import load_for_planning
 
-    report_relocated_paths(options.subject)
-    how = {"checkpoint": options.checkpoint or "selected", "config": options.config, "overrides": options.overrides}
-    return load_for_planning(options.subject, **how)
+    report_remote_urls(options.subject)
+    checkpoint = options.checkpoint or "selected"
+    return load_for_planning(options.subject, checkpoint=checkpoint, config=options.config, overrides=options.overrides)
 
 
 def open_data(config: Config, reporter: ConsoleReporter) -> Dataset:
@@ -342,60 +353,62 @@ def require_new_path(folder: Path) -> None:
         check_local_writable(folder)
 
 
-def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
+def parse_arguments(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse a command line in which `key=value` may be at any position after a command that accepts overrides.
 
     argparse itself reports such words as unknown arguments if they follow an option.
     """
     options, rest = parser.parse_known_args(arguments)
-    parser, no_overrides = options.parser, [word for word in rest if "=" not in word or _OPTION.match(word)]
-    takes_keys = hasattr(options, "overrides")
-    if any(map(_OPTION.match, no_overrides)) or (rest and not takes_keys):
-        unknown = no_overrides if takes_keys else rest
-        text = f"unrecognized arguments: {' '.join(unknown)}. {did_you_mean(unknown[0], parser._option_string_actions)}"
-        parser.error(text.removesuffix(". ").rstrip())
-    if no_overrides and vars(options).get("subject") != "record":  # the argument of `simulate record` is a folder
-        words = " ".join(no_overrides)
-        parser.error(f"{words!r} is no key=value (numbers go in one word: 0.4,0,0.3; names side by side)")
+    parser, non_overrides = options.parser, [word for word in rest if "=" not in word or _OPTION.match(word)]
+    takes_overrides = hasattr(options, "overrides")
+    if any(map(_OPTION.match, non_overrides)) or (rest and not takes_overrides):
+        unknown = non_overrides if takes_overrides else rest
+        hint = did_you_mean(unknown[0], parser._option_string_actions)
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}. {hint}All options: `{parser.prog} --help`")
+    if non_overrides and vars(options).get("subject") != "record":  # the argument of `simulate record` is a folder
+        words = " ".join(non_overrides)
+        parser.error(f"{words!r} is not key=value (write numbers in one word, such as 0.4,0,0.3)")
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
 
 
-def _reader(read: Callable[[str], _Read]) -> Callable[[str], _Read]:
-    """Convert a parser of values into one for argparse. The message of its ValueError is appended to the value."""
+def _reader(read: Callable[[str], _Value]) -> Callable[[str], _Value]:
+    """Convert a function that raises ValueError for argparse. Its message is printed after the value."""
 
-    def value(text: str) -> _Read:
+    def read_value(text: str) -> _Value:
         try:
             return read(text)
         except ValueError as error:
             raise argparse.ArgumentTypeError(f"{text!r} {error}") from None
 
-    return value
+    return read_value
 
 
 def _config_path(text: str) -> str:
     if paths.is_url(text):
-        raise ValueError(f"is a URL. If it holds data, run `{shell_command('init', text)}`, which writes a config")
+        raise ValueError(
+            f"is a URL. If the URL contains data, run `{shell_command('init', text)}`, which writes a config"
+        )
     return paths.resolve_local_path(text)
 
 
 as_config = _reader(_config_path)  # a local config file, or builtin:NAME
 as_local = _reader(paths.resolve_local_path)  # a local path as text; `~` is the user's home folder
 as_path = _reader(lambda text: Path(paths.resolve_local_path(text)))
-as_place = _reader(paths.resolve_path_or_url)  # a local path or a URL
+as_path_or_url = _reader(paths.resolve_path_or_url)  # a local path or a URL
 as_model = _reader(paths.resolve_model_path)  # a local path, or builtin:NAME
 
 
-def whole_number(least: int, most: int = _MOST) -> Callable[[str], int]:
-    """Return a parser of integers from `least` to `most`; the default of `most` is practically unlimited."""
-    return _numbers(int, lambda number: least <= number <= most, f"a whole number from {least} to {most}")
+def whole_number(minimum: int, maximum: int = _MAX_COUNT) -> Callable[[str], int]:
+    """Return a parser of integers in a range, bounds included."""
+    return _numbers(int, lambda number: minimum <= number <= maximum, f"a whole number from {minimum} to {maximum}")
 
 
-def number_between(least: float, most: float, unit: str) -> Callable[[str], float]:
-    """Return a parser of numbers with a unit, strictly between the bounds."""
-    expected = f"a number of {unit} above {least:g} and below {most:g}"
-    return _numbers(float, lambda number: least < number < most, expected)
+def number_between(lower: float, upper: float, unit: str = "") -> Callable[[str], float]:
+    """Return a parser of numbers strictly between the bounds. Messages name the unit."""
+    expected = f"a number {f'of {unit} ' * bool(unit)}above {lower:g} and below {upper:g}"
+    return _numbers(float, lambda number: lower < number < upper, expected)
 
 
 def _numbers(
@@ -419,7 +432,7 @@ def _numbers_in(text: str) -> np.ndarray:
     try:
         return np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError as error:
-        raise ValueError(f"is no list of numbers with commas between them ({error})") from None
+        raise ValueError(f"is not a list of numbers separated by commas ({error})") from None
 
 
 as_numbers = _reader(_numbers_in)
@@ -438,10 +451,10 @@ def _camera_pose(text: str) -> np.ndarray:
     return extrinsics
 
 
-# ---- the command that a command recommends as the next step ----
+# ---- words of a recommended next command ----
 
 
-def option_words(options: argparse.Namespace, *names: str) -> list[str]:
+def make_option_words(options: argparse.Namespace, *names: str) -> list[str]:
     """Return the command-line words that set options to their current values; defaults are left out.
 
     Args:
@@ -457,11 +470,11 @@ def option_words(options: argparse.Namespace, *names: str) -> list[str]:
     return words
 
 
-def quick_words(words: Sequence[str], planning: PlanningConfig, *, on_cpu: bool) -> list[str]:
+def make_quick_overrides(words: Sequence[str], planning: PlanningConfig, *, on_cpu: bool) -> list[str]:
     """Return the overrides of the quick search if a search on a CPU would take long.
 
     Args:
-        words: Overrides of the user. If they set the size of the search, the result is empty.
+        words: The user's overrides. If they set the size of the search, the result is empty.
         planning: The planning config.
         on_cpu: Whether the model runs on a CPU; otherwise the result is empty.
     """
@@ -470,4 +483,4 @@ def quick_words(words: Sequence[str], planning: PlanningConfig, *, on_cpu: bool)
     is_chosen = any(word.startswith(("planning.samples=", "planning.iterations=")) for word in words)
     is_sampled, elites = planning.planner.name != "gradient", planning.planner.options.get("elites", ELITES)
     is_long = is_sampled and planning.budget_s is None and sum(count_samples_per_iteration(planning)) > _QUICK_SEQUENCES
-    return [*QUICK_WORDS] if on_cpu and is_long and not is_chosen and elites <= QUICK["samples"] else []
+    return [*QUICK_OVERRIDES] if on_cpu and is_long and not is_chosen and elites <= QUICK["samples"] else []

@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
     from vjepa2_ac.planning.goals import SubGoal
 
-_QUICK = " ".join(cli.QUICK_WORDS)
+_QUICK = " ".join(cli.QUICK_OVERRIDES)
 _COLUMNS = 100
 
 
 def add_plan(commands: cli.Commands) -> None:
     """Add `plan` to a parser."""
-    parser = cli.command(commands, "plan", _plan, "demo/run --start a.png --goal b.png --state 0.4,0,0.3,3,0,0,0")
-    cli.add_planner(parser, such_as=f"such as planning.horizon=2; for a CPU: {_QUICK}")
+    parser = cli.add_command(commands, "plan", _plan, "demo/run --start a.png --goal b.png --state 0.4,0,0.3,3,0,0,0")
+    cli.add_planner(parser, f"such as planning.horizon=2; for a CPU: {_QUICK}")
     cli.add(parser, "--start IMAGE", "the current camera image: PNG or JPEG", cli.as_local, required=True)
     text = "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or a vector"
     cli.add(parser, "--state NUMBERS", text, cli.as_numbers, required=True)
@@ -39,13 +39,12 @@ def add_plan(commands: cli.Commands) -> None:
         action="append",
     )
     cli.add(goals, "--goals FOLDER", "a folder of goals, written by `vjepa2-ac goals`", cli.as_path)
-    cli.add(
-        goals, "--goal-from EPISODE", "the last frame of an episode of the run's data; EPISODE:STEP: this control step"
-    )
+    text = "the last frame of an episode of the run's data; EPISODE:STEP: the frame at this control step"
+    cli.add(goals, "--goal-from EPISODE", text)
     cli.add(parser, "--out FOLDER", "output folder (plan)", cli.as_path, default=Path("plan"))
     cli.add(parser, "--mask IMAGE", "mask of the goal image, of the same size: black pixels are ignored", cli.as_local)
-    group = parser.add_argument_group("the search, and its image")
-    cli.add(group, "--seed N", "random seed of the search (the config's)", cli.whole_number(0, 2**31 - 1))
+    group = parser.add_argument_group("the search and its image")
+    cli.add(group, "--seed N", "random seed of the search (the seed in the config)", cli.whole_number(0, 2**31 - 1))
     cli.add(
         group,
         "--nodes N",
@@ -53,14 +52,14 @@ def add_plan(commands: cli.Commands) -> None:
         cli.whole_number(0, 101),
         default=9,
     )
-    cli.add_decoder(group, "the predicted frames in the image, next to the goal")
+    cli.add_decoder(group, "the predicted frames next to the goal")
 
 
 def add_goals(commands: cli.Commands) -> None:
     """Add `goals` to a parser."""
-    parser = cli.command(commands, "goals", _goals, "my_robot.yaml --episode 3 --out goals/cup")
+    parser = cli.add_command(commands, "goals", _goals, "my_robot.yaml --episode 3 --out goals/cup")
     cli.add(parser, "source CONFIG", "the config of the data with the episode", cli.as_local)
-    cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
+    cli.add_overrides(parser, "config keys to change, such as data.camera=wrist_left")
     cli.add(parser, "--out FOLDER", "output folder, new or empty", cli.as_path, required=True)
     cli.add(parser, "--episode ID|NUMBER", "name of the episode, or its number from 0 on (0)", default="0")
     cli.add(parser, "--every N", "use every N-th control step, instead of key frames", cli.count)
@@ -73,9 +72,11 @@ def add_goals(commands: cli.Commands) -> None:
         default=4,
     )
     cli.add(group, "--slack N", "tolerance of a goal's duration in model steps (3)", cli.whole_number(0), default=3)
-    share, energy = cli.number_between(0.0, 1.0, "the energy"), "below this fraction of the energy at a goal's start"
-    cli.add(group, "--share X", f"{energy} the next goal applies (none: after its steps)", share)
-    cli.add(group, "--stop-share X", f"{energy} the last goal is reached (none: an equal image)", share)
+    fraction = cli.number_between(0.0, 1.0)
+    text = "use the next goal when the energy is below X times its value at the goal's start (only after N steps)"
+    cli.add(group, "--share X", text, fraction)
+    text = "the same for the end of the last goal (only an image that equals the goal)"
+    cli.add(group, "--stop-share X", text, fraction)
 
 
 def _plan(options: argparse.Namespace) -> int:
@@ -89,12 +90,12 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.planning.goals import require_goal_ends
 
     state = options.state
-    config = cli.require_to_plan(options)
+    config = cli.read_planning_config(options)
     get_state_space(config.data, len(state)).require_state(state, "--state")  # the model checks the width later
     cli.make_folder(options.out)
-    goals = _goals_of(options, config)
+    goals = _read_goals(options, config)
     require_goal_ends(goals, first=1)
-    start, mask = _images(options, goals[0].image)
+    start, mask = _read_images(options, goals[0].image)
 
     from vjepa2_ac.cli.tables import plan_table
     from vjepa2_ac.decoding.decoder import load_decoder
@@ -108,8 +109,8 @@ def _plan(options: argparse.Namespace) -> int:
     if decoder is not None:
         decoder.require_fit(session.world_model, session.config.data, subject=options.subject)
     request = PlanRequest(start, state, goals, mask)
-    with cli.reporter() as reporter:
-        reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
+    with cli.make_reporter() as reporter:
+        reporter.note(_describe_search(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
         controller = Controller.of_subject(session, seed=options.seed, extrinsics=options.extrinsics)
         controller.planner.progress = reporter.task("planning", "action sequences")
         result = decide(controller, request, nodes=options.nodes, reporter=reporter)
@@ -125,8 +126,8 @@ def _plan(options: argparse.Namespace) -> int:
     return int(result.decision.why == "no finite energy" or bool(result.worse_than))
 
 
-def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
-    """Return a line with the size of the search, and on a CPU the overrides of a faster search."""
+def _describe_search(config: PlanningConfig, *, on_cpu: bool) -> str:
+    """Return a line with the size of the search, and on a CPU a line with the overrides for a faster search."""
     from vjepa2_ac.planning.planner import count_samples_per_iteration
 
     sequences, steps = (
@@ -135,12 +136,12 @@ def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
     )
     text = f"Planning: {sequences} of {steps} in {counted(config.iterations, 'iteration')}"
     text += "" if config.budget_s is None else f", for {config.budget_s:g} s at most"
-    quick = cli.quick_words([], config, on_cpu=on_cpu)
+    quick = cli.make_quick_overrides([], config, on_cpu=on_cpu)
     return f"{text}." + f"\nQuick, for a CPU: {_QUICK}" * bool(quick)
 
 
-def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read the start image and the mask, and check that they fit the goal image, before a model is loaded."""
+def _read_images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read the start image and the mask. Check that they have the size of the goal image, before a model is loaded."""
     from vjepa2_ac.media.images import read_image, require_image, require_mask
 
     start = read_image(options.start)
@@ -151,7 +152,7 @@ def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, 
     return start, mask
 
 
-def _goals_of(options: argparse.Namespace, config: Config) -> tuple[SubGoal, ...]:
+def _read_goals(options: argparse.Namespace, config: Config) -> tuple[SubGoal, ...]:
     """Return the goals: from a folder, from an episode, or from images that divide the horizon equally."""
     from vjepa2_ac.media.images import read_image, require_image
     from vjepa2_ac.planning.goals import make_timed_goals, read_goal_folder, split_horizon
@@ -178,15 +179,15 @@ def _goals(options: argparse.Namespace) -> None:
 
     cli.require_new_path(options.out)
     config = cli.read_config(options.source, options.overrides)
-    stride = require_stride(config.data, to="make goals", fix="Say how many control steps it has: data.stride=4")
+    stride = require_stride(config.data, to="make goals", fix="Set it, for example data.stride=4")
 
     from vjepa2_ac.cli.tables import goals_table
     from vjepa2_ac.goals.make_goals import KeyFrameOptions, make_goals
     from vjepa2_ac.reports.planning_figures import GOALS_IMAGE, plot_goals
 
-    chosen = cli.record_of_options(KeyFrameOptions, options, stride=stride, views=config.planning.views)
-    with cli.reporter() as reporter:
-        made = make_goals(config.data, options.episode, chosen, reporter.task(INDEXING))
+    key_frame_options = cli.make_record(KeyFrameOptions, options, stride=stride, views=config.planning.views)
+    with cli.make_reporter() as reporter:
+        goals = make_goals(config.data, options.episode, key_frame_options, reporter.task(INDEXING))
     with translate_write_errors(options.out):
-        written = [made.write(options.out), plot_goals(made, options.out / GOALS_IMAGE)]
-    cli.show(goals_table(made), files=written)
+        written = [goals.write(options.out), plot_goals(goals, options.out / GOALS_IMAGE)]
+    cli.show(goals_table(goals), files=written)

@@ -15,21 +15,23 @@ _FORMS = ("targets", "deltas", "offsets")
 
 def add_score(commands: cli.Commands) -> None:
     """Add `score` to a parser."""
-    parser = cli.command(commands, "score", _score, "demo/run --policy mine.npz --policy other.npz")
-    cli.add_planner(parser, such_as="such as planning.energy.distance=l2")
+    parser = cli.add_command(commands, "score", _score, "demo/run --policy mine.npz --policy other.npz")
+    cli.add_planner(parser, "such as planning.energy.distance=l2")
     text = "actions of a policy at recorded frames (.npz); repeat the option for several policies"
     cli.add(parser, "--policy FILE", text, cli.as_path, action="append", dest="policies", required=True)
-    text = "rows are poses to reach, changes from pose to pose, or changes from the first pose (targets)"
+    text = (
+        "targets: poses to reach; deltas: changes from pose to pose; offsets: changes from the current pose (targets)"
+    )
     cli.add(parser, "--form FORM", text, choices=_FORMS, default="targets")
-    cli.add(parser, "--control-steps N", "control steps of a chunk in one model step (data.stride)", cli.count)
+    cli.add(parser, "--control-steps N", "steps of a chunk in one model step (data.stride)", cli.count)
     cli.add(parser, "--out FILE", "output file (score.json)", cli.as_path, default=Path("score.json"))
 
 
 def add_prior(commands: cli.Commands) -> None:
     """Add `prior` to a parser."""
-    parser = cli.command(commands, "prior", _prior, "demo/run")
+    parser = cli.add_command(commands, "prior", _prior, "demo/run")
     cli.add(parser, "subject RUN|CONFIG", "a run or a config, whose data and encoder are used", cli.as_local)
-    cli.add(parser, "overrides key=value", "of the config, such as training.device=cpu", nargs="*")
+    cli.add_overrides(parser, "config keys to change, such as training.device=cpu")
     cli.add(parser, "--out FOLDER", "output folder (prior in the run's folder)", cli.as_path)
     cli.add(parser, "--steps N", "optimizer steps (2000)", cli.count)
     cli.add(
@@ -39,22 +41,22 @@ def add_prior(commands: cli.Commands) -> None:
 
 def add_monitor(commands: cli.Commands) -> None:
     """Add `monitor` to a parser."""
-    parser = cli.command(commands, "monitor", _monitor, "demo/run --episode 3")
-    cli.add_planner(parser, such_as="such as model.dtype=bfloat16")
-    cli.add(parser, "--data CONFIG", "a config: use episodes of its data (the run's data)", cli.as_local)
+    parser = cli.add_command(commands, "monitor", _monitor, "demo/run --episode 3")
+    cli.add_planner(parser, "such as model.dtype=bfloat16")
+    cli.add(parser, "--data CONFIG", "a config, whose data are checked (the run's data)", cli.as_local)
     cli.add(parser, "--episode ID|NUMBER", "an episode to check; repeatable", action="append", default=[])
-    share = cli.number_between(0.0, 1.0, "a share")
+    fraction = cli.number_between(0.0, 1.0)
     cli.add(
         parser,
         "--false-alarms SHARE",
         "maximum fraction of undisturbed episodes with an alarm (0.05)",
-        share,
+        fraction,
         default=0.05,
     )
     cli.add(
         parser,
         "--threshold FILE",
-        "a monitor.json with the threshold (computed from the held-out episodes)",
+        "a monitor.json with the threshold (a new one, calibrated on the held-out episodes)",
         cli.as_local,
     )
     cli.add(parser, "--out FOLDER", "output folder (the run's folder)", cli.as_path)
@@ -66,7 +68,7 @@ def _score(options: argparse.Namespace) -> int:
     An action chunk is better than another if the model predicts an outcome closer to the goal. The exit status is 1 if
     the model ranks true actions no better than chance.
     """
-    cli.require_to_plan(options)
+    cli.read_planning_config(options)
 
     from vjepa2_ac.cli.tables import scores_table
     from vjepa2_ac.data.windows import require_frames
@@ -76,17 +78,17 @@ def _score(options: argparse.Namespace) -> int:
     policies = [read_policy_chunks(file) for file in options.policies]
     session = cli.load_planning_session(options)
     require_frames(session.config.data, to="score policies at")
-    with cli.reporter() as reporter:
+    with cli.make_reporter() as reporter:
         scores = score_policies(
             Controller.of_subject(session, extrinsics=options.extrinsics),
             cli.open_data(session.config, reporter),
             policies,
             form=options.form,
             control_steps=options.control_steps,
-            progress=reporter.task("scoring", "places"),
+            progress=reporter.task("scoring", "frames"),
         )
-    share = f"{scores.others_below_true:.0%} of the actions of other places"
-    notes = [f"{share} have a lower energy than the true ones (chance {CHANCE:.0%})."]
+    share = f"{scores.others_below_true:.0%} of the actions from other frames"
+    notes = [f"{share} have a lower energy than the true actions (chance {CHANCE:.0%})."]
     if scores.is_blind:
         notes.append("Not ranked: the model ranks the true actions no better than chance on these data.")
     if scores.left_out:
@@ -103,11 +105,11 @@ def _monitor(options: argparse.Namespace) -> int:
     without disturbances. With `planning.monitor=FILE`, `serve` reports alarms.
     The exit status is 1 if a checked episode has an alarm.
     """
-    if (views := cli.require_to_plan(options).planning.views) > 1:
-        needed, fix = "1: a monitor is made with one camera", "Add planning.views=1"
+    if (views := cli.read_planning_config(options).planning.views) > 1:
+        needed, fix = "1, because a monitor uses one camera", "Add planning.views=1"
         raise InputError(where="planning.views", found=f"{views}", needed=needed, fix=fix)
     if options.out is None and not is_run(options.subject):
-        problem, needed = "a model, which has no folder for the monitor", "the folder of a run; or a model with --out"
+        problem, needed = "a model, which has no folder for the monitor", "the folder of a run, or a model with --out"
         raise InputError(
             where=str(options.subject), found=problem, needed=needed, fix="Add --out FOLDER and --data CONFIG"
         )
@@ -117,16 +119,16 @@ def _monitor(options: argparse.Namespace) -> int:
 
     from dataclasses import asdict
 
-    from vjepa2_ac.cli.tables import watched_table
+    from vjepa2_ac.cli.tables import surprise_table
     from vjepa2_ac.data.dataset import find_episode
     from vjepa2_ac.policies.monitor import MONITOR, Monitor, calibrate_monitor, measure_episodes
 
     session = cli.load_planning_session(options)
     model, files = session.world_model, []
-    with cli.reporter() as reporter:
+    with cli.make_reporter() as reporter:
         dataset = cli.open_data(session.config, reporter)
-        watched_data = dataset if data is None else cli.open_data(data, reporter)
-        episodes = [find_episode(watched_data, name) for name in options.episode]
+        checked_data = dataset if data is None else cli.open_data(data, reporter)
+        episodes = [find_episode(checked_data, name) for name in options.episode]
         if options.threshold is None:
             progress = reporter.task("held-out episodes", "episodes")
             monitor = calibrate_monitor(model, dataset, options.false_alarms, progress)
@@ -135,12 +137,12 @@ def _monitor(options: argparse.Namespace) -> int:
             monitor = Monitor.read(
                 options.threshold, model.fingerprints(), tokens=model.num_tokens, where="--threshold"
             )
-        watched = list(measure_episodes(model, watched_data, episodes, reporter.task("watching", "episodes")))
+        measured = list(measure_episodes(model, checked_data, episodes, reporter.task("checking", "episodes")))
     source = f"{counted(len(monitor.scores), 'held-out episode')} of up to {counted(monitor.steps, 'model step')}"
     note = f"An alarm is a surprise above {monitor.threshold:.4g}, calibrated on {source}. At most"
     note += f" {monitor.false_alarms:.1%} of undisturbed episodes have an alarm."
-    cli.show(*([watched_table(watched, monitor)] if watched else []), note, files=files)
-    return int(any(episode.find_first_alarm(monitor) is not None for episode in watched))
+    cli.show(*([surprise_table(measured, monitor)] if measured else []), note, files=files)
+    return int(any(episode.find_first_alarm(monitor) is not None for episode in measured))
 
 
 def _prior(options: argparse.Namespace) -> None:
@@ -157,8 +159,8 @@ def _prior(options: argparse.Namespace) -> None:
     from vjepa2_ac.policies.action_prior import PriorOptions, train_prior
 
     folder = options.out or Path(options.subject if run else config.run_dir) / "prior"
-    with cli.reporter() as reporter:
-        card = train_prior(config, folder, cli.record_of_options(PriorOptions, options), reporter)
+    with cli.make_reporter() as reporter:
+        card = train_prior(config, folder, cli.make_record(PriorOptions, options), reporter)
     text = "Error on held-out clips: not measured; it needs a test split."
     if errors := card.held_out:
         true, shuffled = (errors[name]["value"] for name in ("true_goals", "goals_of_others"))

@@ -1,4 +1,4 @@
-"""The command-line program: parse the arguments, call one function, print its result."""
+"""The command-line program: parses the arguments and runs one command."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 from vjepa2_ac import __version__, process
 from vjepa2_ac.cli import closed_loop, data, evaluate, explore, plan, policies, setup, train
-from vjepa2_ac.cli.options import Commands, Handler, Parser, add_commands, parsed
+from vjepa2_ac.cli.options import Commands, Handler, Parser, add_commands, parse_arguments
 from vjepa2_ac.cli.waiting import watch_silence
 from vjepa2_ac.errors import (
     InputError,
@@ -39,10 +39,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # were ten times slower (commit 0d046757).
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     atexit.register(gc.freeze)  # skips the garbage collection of PyTorch's 500,000 objects when the program exits
-    with process.guard_output() as lost, _print_package_warnings(), exit_on_signals():
+    with process.guard_output() as get_output_error, _print_package_warnings(), exit_on_signals():
         status = _run(arguments)
-        if problem := lost():
-            _complain(f"standard output: cannot be written ({problem}): some output is missing")
+        if problem := get_output_error():
+            _print_error(f"standard output: cannot be written ({problem}): some output is missing")
             return status or 2
         return status
 
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: Sequence[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     try:
-        options = parsed(_parser(), words)
+        options = parse_arguments(_make_parser(), words)
         options.words = words
         handler: Handler = options.handler
         _require_working_directory()
@@ -60,17 +60,17 @@ def _run(arguments: Sequence[str] | None) -> int:
             register_plugins(options.plugin)
         with watch_silence():
             return handler(options) or 0
-    except ModuleNotFoundError as error:  # most missing libraries of extras already raise a UserError
+    except ModuleNotFoundError as error:  # libraries of extras for which no UserError was raised
         library = (error.name or "vjepa2_ac").partition(".")[0]
         if library == "vjepa2_ac":
             raise
-        _complain(f"{library}: it is not installed. Run {pip_install(extra_for_library(library))}")
+        _print_error(f"{library}: it is not installed. Run {pip_install(extra_for_library(library))}")
         return 2
     except (UserError, OSError, MemoryError, RuntimeError) as error:  # OSError: for example a full disk
         if isinstance(error, RuntimeError) and not is_out_of_memory(error):
             raise
         if not getattr(error, "is_reported", False):
-            _complain(describe_error(error))
+            _print_error(describe_error(error))
         return 2
     except StoppedError as stopped:
         if is_first_process():
@@ -85,7 +85,7 @@ def _require_working_directory() -> None:
     """Check that the working directory exists. Relative paths need it, and so does the import of PyTorch's libraries.
 
     Raises:
-        InputError: It was deleted or unmounted.
+        InputError: The working directory was deleted or unmounted.
     """
     try:
         Path.cwd()
@@ -94,11 +94,11 @@ def _require_working_directory() -> None:
         raise InputError(where="working directory", found=problem, fix=fix) from None
 
 
-def _complain(error: str) -> None:
+def _print_error(error: str) -> None:
     print(printable(f"error: {error}"), file=sys.stderr)
 
 
-class _Warning(logging.Formatter):
+class _WarningFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         return printable(f"warning: {super().format(record)}")
 
@@ -107,7 +107,7 @@ class _Warning(logging.Formatter):
 def _print_package_warnings() -> Iterator[None]:
     """Print the log warnings of this package to stderr within the context. Loggers of libraries are not changed."""
     logger, handler = logging.getLogger("vjepa2_ac"), logging.StreamHandler()
-    handler.setFormatter(_Warning())
+    handler.setFormatter(_WarningFormatter())
     logger.addHandler(handler)
     try:
         yield
@@ -115,7 +115,7 @@ def _print_package_warnings() -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-def _parser() -> Parser:
+def _make_parser() -> Parser:
     parser = Parser(prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and measure whether it improved.")
     parser.add_argument("--version", action="version", version=__version__, help="show the version")
     parser.epilog = "`vjepa2-ac COMMAND --help` begins with an example."

@@ -23,17 +23,17 @@ from vjepa2_ac.reporter import Reporter
 _FIRST_LINE_S, _LINE_EVERY_S = 4.0, 10.0
 _WIDE = 120  # columns; at least this width shows a long bar
 _CELL_BORDER = 3  # columns between two cells: a border and two spaces
-_WHOLE = 16  # characters; a longer word in a table, such as a path, may be split over lines
+_MAX_UNSPLIT_WORD = 16  # characters; a longer word in a table, such as a path, may be split over lines
 _LONGEST_LINE = 100  # columns
 _COMMAND = r"(Next: )?(?<![\w/.-])(vjepa2-ac |(\S+ -m )?pip install )((?!   #).)*"
 _UNBREAKABLE = re.compile(rf"^ +|`[^`\n]*`|{_COMMAND}|(?<=\d) %", re.MULTILINE)
 _SPACE = "\ue000"  # stands for a non-breaking space
 
 
-def wrapped(text: str) -> str:
+def wrap_text(text: str) -> str:
     """Wrap a text to lines of at most 100 columns. A shell command stays on one line, so that it can be copied.
 
-    If a line has columns, which are separated by two or more spaces, continuation lines are indented to the last one.
+    If a line has columns (separated by two or more spaces), continuation lines are indented to the last column.
     """
     width, lines = min(_LONGEST_LINE, console.width), []
     for line in _UNBREAKABLE.sub(lambda match: match[0].replace(" ", _SPACE), text).split("\n"):
@@ -81,11 +81,11 @@ class MetricsTable(Table):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Any]:
         """Render the table. The widest columns are narrowed first, at least to their longest unsplit word."""
         texts = [[str(text) for text in (column.header, *column.cells)] for column in self.columns]
-        words = [[cell_len(word) for text in of_column for word in text.split()] for of_column in texts]
-        least = [max((size for size in sizes if size <= _WHOLE), default=1) for sizes in words]
-        widths = [max(map(cell_len, of_column), default=1) for of_column in texts]
+        words = [[cell_len(word) for text in column_texts for word in text.split()] for column_texts in texts]
+        min_widths = [max((size for size in sizes if size <= _MAX_UNSPLIT_WORD), default=1) for sizes in words]
+        widths = [max(map(cell_len, column_texts), default=1) for column_texts in texts]
         available = options.max_width - len(widths) * _CELL_BORDER - 1
-        while sum(widths) > available and (reducible := [n for n, width in enumerate(widths) if width > least[n]]):
+        while sum(widths) > available and (reducible := [n for n, width in enumerate(widths) if width > min_widths[n]]):
             widths[max(reducible, key=lambda n: widths[n])] -= 1
         for column, width in zip(self.columns, widths, strict=True):
             column.width = width
@@ -99,7 +99,7 @@ if not console.is_terminal:
 
 def show(*parts: str | Table, files: Iterable[str | Path] = ()) -> None:
     """Print texts and tables, then one line for each written file."""
-    for part in (*(wrapped(item) if isinstance(item, str) else item for item in parts), *(f"  {f}" for f in files)):
+    for part in (*(wrap_text(item) if isinstance(item, str) else item for item in parts), *(f"  {f}" for f in files)):
         console.print(part)
 
 
@@ -172,7 +172,7 @@ class ConsoleReporter(Reporter):
 
     def note(self, text: str) -> None:
         """Print a message."""
-        console.print(wrapped(text))
+        console.print(wrap_text(text))
 
     def task(self, title: str, unit: str = "") -> ProgressBar:
         """Start a task, which ends the previous one, and return its progress bar."""

@@ -29,54 +29,56 @@ if TYPE_CHECKING:
     from vjepa2_ac.training.cost import MemoryEstimate
 
 _SIMULATED = "demo/data"
-_KNOWN = {"droid": "gs://gresearch/robotics/droid/1.0.1", "sim": _SIMULATED}
+_PATHS_BY_NAME = {"droid": "gs://gresearch/robotics/droid/1.0.1", "sim": _SIMULATED}
 _TRIAL_STEPS = 100
-_LEAST_SHOWN = 500_000  # bytes; smaller parts would be printed as 0.000 GB
-_UNTESTED = (
+_MIN_SHOWN_BYTES = 500_000  # smaller parts would be printed as 0.000 GB
+_ESTIMATE_NOTE = (
     "Estimated with fake tensors. On an H100 the estimate for training from frames was within 1 % of the peak that"
-    " PyTorch measured. For training from cached latents it was not compared after its last change. The CUDA allowance"
-    " was not measured."
+    " PyTorch measured. The current estimate for training from cached latents was not compared with a measurement. The"
+    " CUDA allowance was not measured."
 )
-_SETTINGS = re.compile("(ACCELERATE|CUDA|GOMP|MKL|MUJOCO|NCCL|OMP|PYTORCH|TORCH|VJEPA2_AC)_.*|.*RANK|WORLD_SIZE")
+_REPORTED_VARIABLES = re.compile(
+    "(ACCELERATE|CUDA|GOMP|MKL|MUJOCO|NCCL|OMP|PYTORCH|TORCH|VJEPA2_AC)_.*|.*RANK|WORLD_SIZE"
+)
 _RECORD = "simulate record {path} --domain B --episodes 60 --seed 5"
 
 
 def add_init(commands: cli.Commands) -> None:
     """Add `init` to a parser."""
-    parser = cli.command(commands, "init", _init, "data/my_robot")
-    cli.add(parser, "path PATH", "a folder or a URL; or droid; or sim, the simulated arm", cli.as_place)
+    parser = cli.add_command(commands, "init", _init, "data/my_robot")
+    cli.add(parser, "path PATH", "a folder, a URL, droid, or sim (the simulated arm)", cli.as_path_or_url)
     cli.add(parser, "--out FILE", "the config to write (NAME.yaml, with the name of the data's folder)", cli.as_path)
-    cli.add(parser, "--scratch", "train a new predictor on the encoder --model", action="store_true")
+    cli.add(parser, "--scratch", "train a predictor from scratch; --model is the encoder", action="store_true")
     cli.add(parser, "--model MODEL", "the base model (Meta's released model)", cli.as_model)
     cli.add(parser, "--overwrite", "overwrite an existing config", action="store_true")
 
 
 def add_config_command(commands: cli.Commands) -> None:
     """Add `config` to a parser."""
-    parser = cli.command(commands, "config", _config, "text builtin:own_robot > my_robot.yaml")
+    parser = cli.add_command(commands, "config", _config, "text builtin:own_robot > my_robot.yaml")
     parser.add_argument("what", choices=["schema", "list", "show", "text"])
     cli.add(parser, "config CONFIG", "for show and text: a YAML config, or builtin:NAME", cli.as_local, nargs="?")
-    cli.add(parser, "overrides key=value", "for show: such as training.steps=100", nargs="*")
+    cli.add_overrides(parser, "for show: such as training.steps=100")
 
 
 def add_download(commands: cli.Commands) -> None:
     """Add `download` to a parser."""
-    parser = cli.command(commands, "download", _download, "vjepa2-ac-vitg")
+    parser = cli.add_command(commands, "download", _download, "vjepa2-ac-vitg")
     cli.add(parser, "name NAME", "a name from --list (vjepa2-ac-vitg, the world model, 11.7 GB)", nargs="?")
     cli.add(parser, "--to PATH", "the file to write (checkpoints/NAME.pt)", cli.as_path)
     cli.add(parser, "--url", "another URL of the same file")
-    cli.add(parser, "--list", "list names, sizes and licences, without a download", action="store_true")
+    cli.add(parser, "--list", "list names, sizes and licences, and download nothing", action="store_true")
 
 
 def add_doctor(commands: cli.Commands) -> None:
     """Add `doctor` to a parser."""
-    parser = cli.command(commands, "doctor", _doctor, "my_robot.yaml training.batch_size=4")
+    parser = cli.add_command(commands, "doctor", _doctor, "my_robot.yaml training.batch_size=4")
     cli.add_config(parser, such_as="training.batch_size=4", nargs="?")
 
 
 def add_demo(commands: cli.Commands) -> None:
     """Add `demo` to a parser."""
-    cli.command(commands, "demo", _demo, "    # then look at demo/run/report.html")
+    cli.add_command(commands, "demo", _demo, "    # then look at demo/run/report.html")
 
 
 def _init(options: argparse.Namespace) -> int:
@@ -85,12 +87,12 @@ def _init(options: argparse.Namespace) -> int:
     Uncertain values are marked GUESSED. The data are then checked as by `data check`, with the same exit status, and
     the next commands are printed.
     """
-    path, is_scratch = _KNOWN.get(options.path, options.path), options.scratch
+    path, is_scratch = _PATHS_BY_NAME.get(options.path, options.path), options.scratch
     name = "scratch-" * is_scratch + ("sim" if path == _SIMULATED else _name_of(path))
     out = options.out or Path(f"{name}.yaml")
     if out.exists() and not options.overwrite:
-        fix = "--out another, or --overwrite"
-        raise InputError(where=str(out), found="a file is there", needed="a new one", fix=fix)
+        fix = "Choose another file with --out, or add --overwrite"
+        raise InputError(where=str(out), found="the file exists already", needed="a new file", fix=fix)
     with translate_write_errors(f"--out {out}"):
         check_local_writable(out.parent)
 
@@ -106,7 +108,7 @@ def _init(options: argparse.Namespace) -> int:
     from vjepa2_ac.init.draft import TINY, choose_model, detect_machine, make_draft
     from vjepa2_ac.init.draft_values import list_guesses
 
-    with cli.reporter() as reporter:
+    with cli.make_reporter() as reporter:
         data = data if is_missing else add_episode_lengths(data, reporter.task(INDEXING))
     model, machine = choose_model(options.model or (TINY if path == _SIMULATED else None), is_scratch), detect_machine()
     cli.show(f"Data: {'; '.join(data.descriptions)}.\nMachine: {machine.description}.")
@@ -122,10 +124,11 @@ def _init(options: argparse.Namespace) -> int:
         check, train = shell_command("data", "check", out), shell_command("train", out, "--check")
         cli.show(f"\nFix these errors and run `{check}` again. If it finds no errors, continue with\n`{train}`.")
         return status
-    first = [(f"vjepa2-ac {_RECORD.format(path=path)}", "records the data in about half a minute")] * is_missing
-    if not Path(model.path).exists() and (fetch := model.download):
-        first.append((fetch[0], f"downloads the model ({fetch[1]})"))
-    cli.show("\nNext:", *(f"  {line}   # {about}" for line, about in [*first, *_next(draft, out, name)]))
+    preparations = [(f"vjepa2-ac {_RECORD.format(path=path)}", "records the data in about half a minute")] * is_missing
+    if not Path(model.path).exists() and (download := model.download):
+        preparations.append((download[0], f"downloads the model ({download[1]})"))
+    commands = [*preparations, *_recommend_next(draft, out, name)]
+    cli.show("\nNext:", *(f"  {command}   # {purpose}" for command, purpose in commands))
     return 0
 
 
@@ -136,7 +139,7 @@ def _name_of(path: str) -> str:
 
 
 def _check(draft: Draft, out: Path) -> int:
-    """Run `data check` on the new config and return its exit status. An error is printed, and the config is kept."""
+    """Run `data check` on the new config and return the exit status. An error is printed; the config is not deleted."""
     from vjepa2_ac.cli.data import check_and_print
 
     cli.show(f"\n$ {shell_command('data', 'check', out)}")
@@ -147,7 +150,7 @@ def _check(draft: Draft, out: Path) -> int:
         return 2
 
 
-def _next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
+def _recommend_next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
     """Return the next commands, from a trial to the full run, each with its purpose."""
     trial, steps = f"runs/{name}-trial", draft.config.training.steps
     short = (f"training.steps={_TRIAL_STEPS}", "validation.every=50", "checkpoint.every=50")
@@ -198,18 +201,20 @@ def _download(options: argparse.Namespace) -> None:
             parameters = f"{model.encoder.parameters / 1e6:,.0f} M"
             encoder = f"{model.encoder.name} ({parameters}), {model.image_size} px, key {model.key}"
             cli.show(f"{model.name:<22}{model.model_kind}, {encoder}, {model.size}, {model.licence}")
-        cli.show("The licence is that of Meta's repository. `download` checks the size: Meta publishes no hashes.")
+        cli.show(
+            "The licence is that of Meta's repository. Downloads are checked by size, because Meta publishes no hashes."
+        )
         return
-    known = find_published(options.name or OFFICIAL)
-    path, url = options.to or Path("checkpoints") / known.file, options.url or known.url
+    model = find_published(options.name or OFFICIAL)
+    path, url = options.to or Path("checkpoints") / model.file, options.url or model.url
     cli.show(
-        f"{known.name}: {known.model_kind}, V-JEPA {known.family.removeprefix('v')}, {known.image_size} px,"
-        f" {known.size}"
+        f"{model.name}: {model.model_kind}, V-JEPA {model.family.removeprefix('v')}, {model.image_size} px,"
+        f" {model.size}"
     )
-    cli.show(f"Licence {known.licence}; from {url}; its size is checked")
-    with cli.reporter() as reporter:
-        download(url, path, published=known, reporter=reporter)
-    cli.show(f"Saved to {path}. In a config:  {known.config_key}: {to_config_value(path)}")
+    cli.show(f"Licence: {model.licence}. URL: {url}. The size of the file is checked.")
+    with cli.make_reporter() as reporter:
+        download(url, path, published=model, reporter=reporter)
+    cli.show(f"Saved to {path}. In a config:  {model.config_key}: {to_config_value(path)}")
 
 
 def _doctor(options: argparse.Namespace) -> int:
@@ -250,23 +255,23 @@ def _memory_lines(estimate: MemoryEstimate) -> list[str]:
     weights = estimate.parameters
     counts = f"encoder {weights.encoder:,}, predictor {weights.predictor:,}, trained {weights.trained:,}"
     lines = [f"Parameters: {counts}", "Estimated GPU memory, part by part (not all parts are needed at once):"]
-    parts = {name: size for name, size in estimate.parts.items() if size >= _LEAST_SHOWN}
+    parts = {name: size for name, size in estimate.parts.items() if size >= _MIN_SHOWN_BYTES}
     lines += [f"  {name:<37}{size / 1e9:8.3f} GB" for name, size in parts.items()]
     for checkpointing, word in ((False, "without"), (True, "with")):
         chosen = "  <- this config" if checkpointing == estimate.checkpointing else ""
         total = estimate.total(checkpointing=checkpointing) / 1e9
         lines.append(f"  peak {word + ' checkpointing':<32}{total:8.3f} GB{chosen}")
-    return [*lines, _UNTESTED]
+    return [*lines, _ESTIMATE_NOTE]
 
 
 def _verdict(needed: int, available: int, gpu: str | None, overrides: list[str] | None) -> str:
-    """Return a sentence that states whether the run fits, and otherwise which keys to change.
+    """Return a sentence that states whether the run fits, and if it does not, which keys to change.
 
     Args:
         needed: Estimated peak memory in bytes.
         available: Memory of the GPU in bytes.
-        gpu: Name of the GPU; None: this machine has none.
-        overrides: `key=value` changes with which the run fits; None: there are none.
+        gpu: Name of the GPU; None: this machine has no GPU.
+        overrides: `key=value` changes with which the run fits; None: no such changes are known.
     """
     fits, size, capacity = needed <= available, f"{needed / 1e9:.1f} GB", f"{available / 1e9:.1f} GB"
     if gpu is None:
@@ -293,7 +298,7 @@ def _report_lines() -> Iterator[str]:
     libraries = [line for line in requires("vjepa2-ac") or [] if not re.search("extra == .(data|dev|docs)", line)]
     yield f"Libraries: {', '.join(dict.fromkeys(_with_version(line) for line in libraries))}"
     for key, value in sorted(os.environ.items()):
-        if _SETTINGS.fullmatch(key):
+        if _REPORTED_VARIABLES.fullmatch(key):
             yield f"{key}={'(a path)' if '/' in value else value}"
     gpu = _output("nvidia-smi --query-gpu=name,memory.total,driver_version --format=csv,noheader")
     yield f"GPU: {gpu or 'none'}"
@@ -323,7 +328,7 @@ def _with_version(requirement: str) -> str:
         return f"{name} (not installed)"
 
 
-_CLIP = "--episode B_seed5_00h39_000039 --start 5"  # a held-out clip in which the arm can move within the image
+_DEMO_CLIP = "--episode B_seed5_00h39_000039 --start 5"  # a held-out clip in which the arm can move within the image
 
 
 def _demo(_options: argparse.Namespace) -> int:
@@ -341,7 +346,7 @@ def _demo(_options: argparse.Namespace) -> int:
         _RECORD.format(path=_SIMULATED),
         f"train {BUILTIN}demo",
         f"decoder {BUILTIN}demo",
-        f"imagine demo/run --decoder demo/decoder --actions up,left,none --steps 4 {_CLIP}",
+        f"imagine demo/run --decoder demo/decoder --actions up,left,none --steps 4 {_DEMO_CLIP}",
         "evaluate demo/run --decoder demo/decoder",
     ]
     for words in commands[Path(_SIMULATED).exists() :]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.table import Table
 
-from vjepa2_ac.cli.progress import ConsoleReporter, MetricsTable, console, show, wrapped
+from vjepa2_ac.cli.progress import ConsoleReporter, MetricsTable, console, show, wrap_text
 from vjepa2_ac.errors import counted
 from vjepa2_ac.evaluation.result import ACTIONS, Validation, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.rows import Row, arrange_tables
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from vjepa2_ac.simulation.benchmark import ClosedLoopBenchmark
 
 _COLOURS = {"ok": "green", "warning": "yellow", "error": "red", "skipped": "cyan"}
-_USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of decisions that need no note
+_USUAL_REASONS = {"planned", "nothing", "random", "scripted"}  # for decisions, without a note
 _DECODERS = {"decoder": "decoder", "linear": "linear decoder", "mean_image": "mean image"}
-_MUCH_WAITING = 0.2  # share of the step time; above it more data.workers or a local copy of the data would help
+_NOTABLE_WAIT_SHARE = 0.2  # of the step time; above it more data.workers or a local copy of the data would help
 
 
 def row_tables(rows: Sequence[Row], title: str) -> list[Table]:
-    """Return console tables of all rows that are not marked as detail; adjacent sections with equal columns share one.
+    """Return console tables of all rows except details. Adjacent sections with equal columns share a table.
 
     Args:
         rows: Rows of an evaluation or comparison.
@@ -59,37 +59,37 @@ def row_tables(rows: Sequence[Row], title: str) -> list[Table]:
     return tables
 
 
-def plan_table(answer: PlanResult) -> Table:
+def plan_table(result: PlanResult) -> Table:
     """Return a table of a plan, with the action and the predicted state of each model step.
 
-    For poses there is one row per model step. For other states there is one row per model step and free number.
+    For poses there is one row per model step. For other states each number that may change has its own row.
     """
-    is_pose, turns = answer.state_space.is_pose, bool(answer.actions[:, POSE.rotation].any())
+    is_pose, turns = result.state_space.is_pose, bool(result.actions[:, POSE.rotation].any())
     names = ["number", "changes by", "then"]
     if is_pose:
         turn = ["turn (degrees)"] * turns
         names = ["dx (cm)", "dy (cm)", "dz (cm)", *turn, "gripper", "then x, y, z (m)", "gripper"]
-    why, steps = answer.decision.why, len(answer.actions)
-    has_plan = answer.decision.plan is not None and why != "no finite energy"
+    why, steps = result.decision.why, len(result.actions)
+    has_plan = result.decision.plan is not None and why != "no finite energy"
     title = f"Plan of {counted(steps, 'model step')}" if has_plan else f"Zero action: {why}"
     table = MetricsTable(title, ["step", *names], labelled=False)
-    for step, (action, after) in enumerate(zip(answer.actions, answer.states[1:], strict=True), start=1):
+    for step, (action, after) in enumerate(zip(result.actions, result.states[1:], strict=True), start=1):
         if is_pose:
             motion = [f"{value * 100:+.2f}" for value in action[POSE.position]]
             turn = [" ".join(f"{value:+.1f}" for value in np.degrees(action[POSE.rotation]))] * turns
             then = " ".join(f"{value:.3f}" for value in after[POSE.position])
             table.add_row(str(step), *motion, *turn, f"{action[POSE.gripper]:+.2f}", then, f"{after[POSE.gripper]:.2f}")
             continue
-        for axis in answer.space.free.tolist():
-            table.add_row(str(step), answer.state_space.names[axis], f"{action[axis]:+.4g}", f"{after[axis]:.4g}")
+        for axis in result.space.free.tolist():
+            table.add_row(str(step), result.state_space.names[axis], f"{action[axis]:+.4g}", f"{after[axis]:.4g}")
     return table
 
 
-def goals_table(made: DemonstrationGoals) -> Table:
+def goals_table(goals: DemonstrationGoals) -> Table:
     """Return a table with one row per goal that was extracted from a demonstration."""
     columns = ["goal", "frame", "at least", "at most", "share", "gripper"]
-    table = MetricsTable(f"Goals of {made.origin['episode']} (at least and at most: model steps)", columns)
-    for number, (key, goal) in enumerate(zip(made.keys, made.goals, strict=True), start=1):
+    table = MetricsTable(f"Goals of {goals.origin['episode']} (at least and at most: model steps)", columns)
+    for number, (key, goal) in enumerate(zip(goals.keys, goals.goals, strict=True), start=1):
         name = f"{number} {goal.name}".strip()
         row = [name, str(key.frame), str(goal.at_least), "no limit" if goal.at_most is None else str(goal.at_most)]
         table.add_row(*row, "not used" if goal.share is None else f"{goal.share:g}", goal.gripper or "default")
@@ -102,7 +102,7 @@ def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
     table = MetricsTable(
         f"{trials.task} in {trials.place}: {counted(len(trials.trials), 'problem')} of seed {trials.about['seed']},"
         f" {counted(trials.steps, 'step')} of {trials.seconds_per_step:.2f} s (95 % interval over episodes)",
-        ["", f"{trials.criterion} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
+        ["", f"{trials.criterion} at the end", "at any time", "final distance, cm", "steps", "s per decision"],
     )
     for result in benchmark.results:
         metrics, needed = result.estimates, result.estimates["steps_needed"]
@@ -118,13 +118,13 @@ def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
 
 
 def benchmark_notes(benchmark: ClosedLoopBenchmark) -> tuple[str, ...]:
-    """Return notes on unusual decisions and unreachable commands, one line each; empty if there are none."""
+    """Return notes on the reasons of unusual decisions and on unreachable commands; empty if there are none."""
     notes = []
     for result in benchmark.results:
-        unusual = {why: number for why, number in result.why_counts.items() if why not in _USUAL}
-        if unusual:
-            counts = ", ".join(f"{why} {number}" for why, number in unusual.items())
-            notes.append(f"{result.policy}: of {counted(result.seconds.size, 'decision')} {counts}")
+        decisions = counted(result.seconds.size, "decision")
+        for why, number in result.why_counts.items():
+            if why not in _USUAL_REASONS:
+                notes.append(f"{result.policy}: {number} of {decisions}: {why}")
         if result.unreachable.any():
             notes.append(f"{result.policy}: {counted(result.unreachable.sum(), 'command')} led out of the arm's reach")
     return tuple(notes)
@@ -150,7 +150,7 @@ def _estimate(values: dict[str, float | None]) -> Estimate:
 
 def print_finding(finding: Finding) -> None:
     """Print one line of `data check`."""
-    text = console.render_str(wrapped(f"{finding.level:<7}  {finding.about:<15}  {finding.text}"))
+    text = console.render_str(wrap_text(f"{finding.level:<7}  {finding.about:<15}  {finding.text}"))
     text.stylize(_COLOURS[finding.level], 0, 7)
     console.print(text)
 
@@ -176,7 +176,7 @@ def _estimate_cells(estimate: Estimate | None) -> tuple[str, str]:
 def scores_table(scores: PolicyScores) -> Table:
     """Return a table with one row per scored policy and one for the demonstrated actions."""
     title = f"Energy relative to the zero action, {counted(scores.places, 'frame')}"
-    columns = ["policy", "all chunks", "its best", "behind the one before"]
+    columns = ["policy", "all chunks", "best chunk", "minus the row above"]
     table = MetricsTable(f"{title} of {counted(scores.episodes, 'episode')}", columns)
     for policy in scores.policies:
         behind = "" if policy.behind is None else str(policy.behind)
@@ -185,10 +185,10 @@ def scores_table(scores: PolicyScores) -> Table:
     return table
 
 
-def watched_table(watched: Sequence[EpisodeErrors], monitor: Monitor) -> Table:
-    """Return a table of the highest surprise and the first alarm of each monitored episode."""
-    table = MetricsTable("Surprise, over the threshold", ["episode", "highest", "first alarm at control step"])
-    for episode in watched:
+def surprise_table(episodes: Sequence[EpisodeErrors], monitor: Monitor) -> Table:
+    """Return a table of the highest surprise and the first alarm of each checked episode."""
+    table = MetricsTable("Surprise divided by the threshold", ["episode", "highest", "first alarm at control step"])
+    for episode in episodes:
         first, highest = (
             episode.find_first_alarm(monitor),
             episode.compute_scores(monitor.expected).max() / monitor.threshold,
@@ -215,7 +215,7 @@ class TrainingConsole(ConsoleReporter):
         speed = metrics["samples_per_second"]
         parts = [f"loss {metrics['loss']:.4f}", f"lr {metrics['learning_rate']:.1e}"]
         parts += [f"{speed:.{1 if speed >= 10 else 2}f} clips/s", f"{metrics['memory_gb']:.1f} GB"]
-        if metrics.get("data_wait_share", 0.0) > _MUCH_WAITING:
+        if metrics.get("data_wait_share", 0.0) > _NOTABLE_WAIT_SHARE:
             parts.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
         self._bar(step, self._steps, "  ".join(part for part in parts if part))
 
@@ -236,4 +236,4 @@ class TrainingConsole(ConsoleReporter):
             f"  action-ranking error  {rank}",
         )
         if self._steps:
-            self.on_start(step, self._steps)  # the bar of the validation has replaced that of the training
+            self.on_start(step, self._steps)  # the validation's bar has replaced the training's bar

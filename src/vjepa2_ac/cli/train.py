@@ -17,35 +17,39 @@ from vjepa2_ac.storage import require_new_folder
 
 def add_train(commands: cli.Commands) -> None:
     """Add `train` to a parser."""
-    parser = cli.command(commands, "train", _train, "my_robot.yaml training.steps=1000")
+    parser = cli.add_command(commands, "train", _train, "my_robot.yaml training.steps=1000")
     cli.add_config(parser, such_as="training.learning_rate=3e-4", what="a YAML config, or (--resume) a run's folder")
-    cli.add(parser, "--resume", "resume the run in CONFIG; key=value changes its config", action="store_true")
+    cli.add(
+        parser, "--resume", "resume the run in the folder CONFIG; key=value changes its config", action="store_true"
+    )
     cli.add(parser, "--check", "run all checks, and stop before the first step", action="store_true")
     cli.add(parser, "--allow-config-change", "resume the run although the config has changed", action="store_true")
 
 
 def add_encode(commands: cli.Commands) -> None:
     """Add `encode` to a parser."""
-    parser = cli.command(commands, "encode", _encode, "my_robot.yaml")
+    parser = cli.add_command(commands, "encode", _encode, "my_robot.yaml")
     cli.add_config(parser, such_as="data.cache_dtype=int8")
-    cli.add(parser, "--out FOLDER", "output folder, for data.source: latents (the folder of data.cache)", cli.as_place)
+    cli.add(
+        parser, "--out FOLDER", "output folder, for data.source: latents (the folder of data.cache)", cli.as_path_or_url
+    )
     text = "ray: one actor per GPU (or per CPU core) of this machine; ray=ADDRESS: on a Ray cluster"
     cli.add(parser, "--engine ENGINE", text, _as_engine)
 
 
 def add_decoder_command(commands: cli.Commands) -> None:
     """Add `decoder` to a parser."""
-    parser = cli.command(commands, "decoder", _decoder, "my_robot.yaml")
+    parser = cli.add_command(commands, "decoder", _decoder, "my_robot.yaml")
     cli.add_config(parser, such_as="decoder.size=medium")
     cli.add(parser, "--check", "run all checks, and write nothing", action="store_true")
 
 
 def add_export(commands: cli.Commands) -> None:
     """Add `export` to a parser."""
-    parser = cli.command(commands, "export", _export, "runs/my_robot merged")
+    parser = cli.add_command(commands, "export", _export, "runs/my_robot merged")
     cli.add(parser, "run RUN", "folder of a run", cli.as_path)
     cli.add(parser, "folder FOLDER", "output folder, new or empty; with --to official also a .pt file", cli.as_path)
-    cli.add(parser, "overrides key=value", "model.base=PATH, if the base model was moved", nargs="*")
+    cli.add_overrides(parser, "model.base=PATH, if the base model was moved")
     text = "merged: a model for model.base; official: a .pt with Meta's tensor names; hub: PEFT's format with a card"
     cli.add(parser, "--to", text, choices=["merged", "official", "hub"], default="merged")
     cli.add_checkpoint(parser)
@@ -67,7 +71,7 @@ def _train(options: argparse.Namespace) -> None:
         fix = "To resume the run, add --resume"
         raise InputError(where=options.config, found="the folder of a run", needed="a config file", fix=fix)
     if options.resume:
-        cli.report_relocated_paths(options.config)
+        cli.report_remote_urls(options.config)
         config = read_run_config(path, options.overrides)
         require_base_of_run(config.model, path, options.words)
     else:
@@ -95,18 +99,18 @@ def _encode(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.encoding.encode_dataset import encode_config
 
-    with contextlib.ExitStack() as closing:
+    with contextlib.ExitStack() as exit_stack:
         engine = None
         if options.engine is not None:
             from vjepa2_ac.encoding.ray_engine import ray_engine
 
-            engine = closing.enter_context(ray_engine(options.engine))
-        reporter = closing.enter_context(cli.reporter()) if is_first_process() else SILENT
+            engine = exit_stack.enter_context(ray_engine(options.engine))
+        reporter = exit_stack.enter_context(cli.make_reporter()) if is_first_process() else SILENT
         encoded = encode_config(config, reporter, out=options.out, engine=engine)
         if config.replay is not None and options.out is None and not config.replay.data.is_cache:
             encode_config(config.for_replay(), reporter, engine=engine)
     if not encoded.is_finished:
-        cli.show(f"This process has done its share; others are still at work on {encoded.folder}")
+        cli.show(f"This process is finished. Other processes still encode frames into {encoded.folder}")
         return
     episodes = f"{encoded.encoded:,} of {counted(encoded.episodes, 'episode')}"
     overrides = shlex.join(["data.source=latents", f"data.path={encoded.folder}"]) if options.out else "data.cache=auto"
@@ -118,7 +122,7 @@ def _encode(options: argparse.Namespace) -> None:
 
 
 def _as_engine(text: str) -> str:
-    """Parse the value of --engine: return the address in `ray=ADDRESS`, or an empty text for `ray`."""
+    """Parse the value of --engine: return the address in `ray=ADDRESS`, or an empty string for `ray`."""
     name, separator, address = text.partition("=")
     if name != "ray" or bool(separator) != bool(address):
         raise argparse.ArgumentTypeError(f"{text!r} is neither ray nor ray=ADDRESS")
@@ -129,8 +133,8 @@ def _decoder(options: argparse.Namespace) -> None:
     """Train a decoder that converts latents into images.
 
     The decoder is trained on the latents of true frames. `imagine` and the option --decoder show predicted frames with
-    it. It depends on the encoder and the camera of the config, so all runs with these can use it. If the command is
-    stopped, run the same command again: it resumes from the last checkpoint.
+    it. The decoder depends on the encoder and the camera of the config, so all runs with this encoder and camera can
+    use it. If the command is stopped, run it again to resume from the last checkpoint.
     """
     config = cli.read_config(options.config, options.overrides, base=True)
 
@@ -138,14 +142,14 @@ def _decoder(options: argparse.Namespace) -> None:
     from vjepa2_ac.decoding.decoder import read_card
     from vjepa2_ac.decoding.training import train_decoder
 
-    with cli.reporter() as reporter:
+    with cli.make_reporter() as reporter:
         folder = train_decoder(config, reporter, check_only=options.check)
     if options.check:
         cli.show("All checks passed: data, model, folder and disk. Nothing was written.")
         return
     card = read_card(folder)
     cli.show(held_out_table(card) if card.held_out else "Held-out frames: not measured; they need a test split.")
-    cli.show(f"See what a model imagines: {shell_command('imagine', config.run_dir, '--decoder', folder)}")
+    cli.show(f"To show predicted frames of a model: {shell_command('imagine', config.run_dir, '--decoder', folder)}")
 
 
 def _export(options: argparse.Namespace) -> None:
@@ -157,7 +161,9 @@ def _export(options: argparse.Namespace) -> None:
     from vjepa2_ac.export import export_run
 
     written = export_run(options.run, options.folder, options.to, options.checkpoint, options.overrides)
-    what = {"merged": "merged model", "official": "official checkpoint", "hub": "adapter with its model card"}
-    cli.show(f"The {what[options.to]} of checkpoint {written.checkpoint} is in {written.path}")
+    descriptions = {"merged": "merged model", "official": "official checkpoint", "hub": "adapter with its model card"}
+    cli.show(f"The {descriptions[options.to]} of checkpoint {written.checkpoint} is in {written.path}")
     if options.to == "hub":
-        cli.show("The card names base and data by their paths on this machine: read it before you upload it.")
+        cli.show(
+            "The model card contains the local paths of the base model and the data. Read it before you upload it."
+        )

@@ -1,7 +1,7 @@
 """Status lines on stderr while a command prints nothing for some seconds.
 
 A running progress bar prints continuously, so the lines never interrupt it. The module imports no large library,
-because it runs while these are imported.
+because it runs while large libraries are imported.
 """
 
 from __future__ import annotations

@@ -73,6 +73,21 @@ class ImagineOptions:
     evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, split
 
 
+def require_actions(options: ImagineOptions, *, has_recorded: bool) -> None:
+    """Check the names and files of actions, before a model is loaded.
+
+    Args:
+        options: The options, with the names.
+        has_recorded: Whether there are recorded actions, so that the name `true` is allowed.
+
+    Raises:
+        InputError: A name is unknown, or a file has no valid actions or too few of them.
+    """
+    for name in options.actions:
+        if not (has_recorded and name == TRUE):
+            _load_actions(name, options.steps, options.size_m, limits=None)
+
+
 def imagine_image(session: Subject, options: ImagineOptions, observation: ImageObservation) -> RolloutComparison:
     """Predict and decode the frames after an image, for named actions or actions from files.
 
@@ -137,7 +152,7 @@ def _require_directions(space: StateSpace, *, where: str, fix: str = "") -> None
         raise InputError(where=where, found=problem, needed=needed, fix=fix)
 
 
-def _load_actions(word: str, steps: int, size_m: float, limits: LimitsConfig) -> Float[np.ndarray, "steps 7"]:
+def _load_actions(word: str, steps: int, size_m: float, limits: LimitsConfig | None) -> Float[np.ndarray, "steps 7"]:
     """Return the named actions, or the actions in a file."""
     if word.lower().endswith((".npy", ".csv")):
         return read_actions(word, steps=steps)

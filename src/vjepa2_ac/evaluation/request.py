@@ -101,7 +101,7 @@ def _select_config(subject: str, options: EvaluationOptions) -> Config:
                 where=subject,
                 found="no config.yaml: not the folder of a run" if Path(subject).exists() else "no such folder",
                 needed="the folder of a run, which `vjepa2-ac train CONFIG` creates",
-                fix="To evaluate a model, add --data CONFIG and --out FOLDER",
+                fix="For a model instead of a run, add --data CONFIG; `evaluate` also needs --out FOLDER",
             )
         return run_config
     if options.out is None:

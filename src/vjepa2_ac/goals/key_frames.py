@@ -1,4 +1,4 @@
-"""Key frames of a demonstration: selection of the frames that become goals, and durations for them. Pure functions.
+"""Select key frames of a demonstration, and turn them into goals with durations.
 
 A frame is a control step of an episode, a frame of a video, or a model step.
 """
@@ -21,9 +21,9 @@ States = Float[np.ndarray, "frames 7"]
 
 MIN_GRIPPER_CHANGE = 0.15  # smallest difference of closedness that counts as a change of the gripper
 _MIN_FINGER_MOTION = 0.02  # smallest change of closedness between two frames that counts as motion of the fingers
-_PAUSE = 2  # frames for which the fingers may rest within one change
+_MAX_PAUSE = 2  # frames for which the fingers may rest within one change
 _STILL_M, _STILL_RAD = 0.002, 0.02  # the arm rests if it moves less than this between two frames
-_MIN_DEPARTURE_M = 0.01  # the arm has left the position of a grip if it is farther away than this
+_MIN_DEPARTURE_M = 0.01  # the arm has left the position of a grip if it is at least this far away
 _SAME_M, _SAME_RAD = 0.005, 0.05  # two states count as equal if they differ by less than this
 
 
@@ -52,7 +52,7 @@ def find_gripper_key_frames(states: States, rule: StillRule | None = None) -> tu
 
     If the arm leaves before the fingers rest, the change ends at the last frame before the arm leaves, provided that
     half of the change is done by then. The first frame is never a key frame. If the arm rests at the end, the frame at
-    which it came to rest replaces the last frame.
+    which the arm came to rest replaces the last frame.
 
     Args:
         states: Measured states, with closedness last (conventions: `vjepa2_ac.episode`).
@@ -74,8 +74,8 @@ def find_gripper_key_frames(states: States, rule: StillRule | None = None) -> tu
             names.setdefault(begin, "before closing" if is_closing else "before opening")
         names[_find_end_of_change(states, begin, end)] = "closed" if is_closing else "opened"
     for begin in _find_stops(states, rule.min_rest):
-        is_near = [abs(begin - frame) < rule.min_distance for frame in (0, last, *names)]
-        if not any(is_near) and not any(first <= begin <= end for first, end in changes):
+        is_near = any(abs(begin - frame) < rule.min_distance for frame in (0, last, *names))
+        if not is_near and not any(first <= begin <= end for first, end in changes):
             names[begin] = "stop"
     if not names or not _is_same(states[max(names)], states[last]):
         names[last] = "end"
@@ -90,7 +90,7 @@ def _find_gripper_changes(closedness: Float[np.ndarray, " frames"]) -> list[tupl
     for frame, difference in enumerate(np.diff(closedness)):
         if abs(difference) < _MIN_FINGER_MOTION:
             continue
-        if changes and changes[-1][2] == np.sign(difference) and frame - changes[-1][1] <= _PAUSE:
+        if changes and changes[-1][2] == np.sign(difference) and frame - changes[-1][1] <= _MAX_PAUSE:
             changes[-1] = (changes[-1][0], frame + 1, changes[-1][2])
         else:
             changes.append((frame, frame + 1, float(np.sign(difference))))
@@ -124,19 +124,19 @@ def _are_below(
 
 
 def add_frames_between(keys: Sequence[KeyFrame], step: int, name: str = "on the way") -> tuple[KeyFrame, ...]:
-    """Return key frames, and every `step`-th frame between two of them, counted from the earlier one or the start.
+    """Add to key frames every `step`-th frame between them, counted from the previous key frame or the start.
 
     A planner with a horizon of one step moves straight towards a distant goal, with all axes at their limits. Closer
     goals keep it on the demonstrated path. A frame less than half a step before a key frame is left out.
 
     Args:
-        keys: In order.
+        keys: The key frames, in order.
         step: Number of frames from one goal to the next.
         name: Name of the additional key frames; `{}` is replaced by the frame's number.
     """
     all_frames: list[KeyFrame] = []
-    for before, key in itertools.pairwise((KeyFrame(0, "start"), *keys)):
-        between = [frame for frame in range(before.frame + step, key.frame, step) if 2 * (key.frame - frame) >= step]
+    for previous, key in itertools.pairwise((KeyFrame(0, "start"), *keys)):
+        between = [frame for frame in range(previous.frame + step, key.frame, step) if 2 * (key.frame - frame) >= step]
         all_frames += [*(KeyFrame(frame, name.format(frame)) for frame in between), key]
     return tuple(all_frames)
 
@@ -168,8 +168,8 @@ def make_sub_goals(
 ) -> tuple[SubGoal, ...]:
     """Return key frames as goals, with the demonstration's durations and, if states are given, gripper modes.
 
-    The gripper closes on the way to a key frame at which it is more closed than at the previous one, opens if it is
-    more open, and is otherwise held.
+    The gripper closes on the way to a key frame at which it is more closed than at the previous key frame, opens
+    if it is more open, and otherwise does not move.
 
     Args:
         images: Images of the key frames.
@@ -177,13 +177,13 @@ def make_sub_goals(
         timing: Rules for the durations.
         states: States of all frames of the demonstration; None: the gripper mode is that of planning.limits.
     """
-    goals, before = [], 0
+    goals, previous_frame = [], 0
     for image, key in zip(images, keys, strict=True):
-        steps = max(1, math.ceil((key.frame - before) / timing.stride))
-        gripper = None if states is None else _get_gripper_mode(states[before], states[key.frame])
+        steps = max(1, math.ceil((key.frame - previous_frame) / timing.stride))
+        gripper = None if states is None else _get_gripper_mode(states[previous_frame], states[key.frame])
         low, high = max(1, steps - timing.slack), steps + timing.slack
         goals.append(SubGoal(image, key.name, low, high, timing.share, gripper))
-        before = key.frame
+        previous_frame = key.frame
     return (*goals[:-1], replace(goals[-1], at_most=None, share=timing.stop_share))
 
 

@@ -89,7 +89,7 @@ def make_goals(
     index = find_episode(dataset, episode_name)
     name, states = dataset.table.identity(index), dataset.source.read(index, config.cameras[0]).states
     if len(states) < 2:
-        raise InputError(where=name, found=f"{len(states)} frames", needed="at least 2")
+        raise InputError(where=name, found=counted(len(states), "frame"), needed="at least 2")
     poses = states if config.states == "pose" else None
     if options.every is not None:
         keys = select_every_nth_frame(len(states), options.every)
@@ -113,8 +113,8 @@ def read_episode_frame(config: DataConfig, text: str) -> UInt8[np.ndarray, "heig
     require_frames(config, to="read a goal image")
     dataset = open_dataset(config)
     episode = dataset.source.read(find_episode(dataset, name))
-    count = len(episode.states)
-    if step and int(step) >= count:
-        problem = f"the episode has {counted(count, 'step')}"
-        raise InputError(where=f"--goal-from {text}", found=problem, needed=f"a step from 0 to {count - 1}")
-    return np.asarray(episode.read_frames([int(step) if step else count - 1])[0])
+    num_steps = len(episode.states)
+    if step and int(step) >= num_steps:
+        problem = f"the episode has {counted(num_steps, 'step')}"
+        raise InputError(where=f"--goal-from {text}", found=problem, needed=f"a step from 0 to {num_steps - 1}")
+    return np.asarray(episode.read_frames([int(step) if step else num_steps - 1])[0])

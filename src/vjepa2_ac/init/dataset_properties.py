@@ -76,10 +76,10 @@ def make_camera_values(
 
 
 def make_camera_names(features: Sequence[str]) -> dict[str, str]:
-    """Return a short camera name for each feature: as many last parts of its name as are needed to be unique."""
+    """Return a unique, short camera name for each feature: the last parts of the feature's name."""
     parts = {name: [re.sub(r"\W+", "_", part) for part in re.split(r"[./]", name)] for name in features}
     for count in range(1, 1 + max(map(len, parts.values()), default=0)):
-        short = {name: "_".join(part[-count:]) or "camera" for name, part in parts.items()}
-        if len(set(short.values())) == len(short):
-            return short
+        short_names = {name: "_".join(words[-count:]) or "camera" for name, words in parts.items()}
+        if len(set(short_names.values())) == len(short_names):
+            return short_names
     return {name: name for name in features}

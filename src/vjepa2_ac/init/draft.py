@@ -29,11 +29,11 @@ _BATCHES_WITHOUT_GPU = ((4, False), (4, True), (2, True), (1, True))  # candidat
 _BATCHES_ON_GPU = ((16, False), (8, False), *_BATCHES_WITHOUT_GPU)
 _CLIPS_PER_STEP = 32  # clips per optimizer step, except for the tiny model
 _MODEL_STEP_S = 4 / 15  # shortest of the likely model steps of the released model: 0.27, 0.53 and 1 s
-_FEW_EPISODES = 500  # up to this number the advice for few demonstrations applies
+_FEW_EPISODES = 500  # with more episodes, clips have 16 frames instead of 8
 _MAX_TEST_SHARE = 0.35
-_SHARES = ((5_000, 0.02), (500, 0.05), (100, 0.1), (0, 0.15))  # held-out share if there are more episodes than this
+_SHARES = ((5_000, 0.02), (500, 0.05), (100, 0.1), (0, 0.15))  # (episodes, held-out share with more episodes than this)
 _MIN_FRAMES = 3  # two rollout steps and the first frame
-_CLIPS_PER_CONTROL_STEP = 3
+_CLIPS_PER_CONTROL_STEP = 3  # training clips per control step of the data; determines the number of steps
 _MIN_STEPS, _MAX_STEPS = 200, 100_000
 _MIN_STEPS_FOR_IDLE_FILTER = 100  # control steps; the filter for idle steps is not used for shorter episodes
 _CACHE_SHARE = 1 / 3  # share of the free disk space that a latent cache may use
@@ -52,7 +52,7 @@ class Machine:
 
     @property
     def precision(self) -> Literal["bf16", "fp16", "fp32"]:
-        """The preferred precision; fp32 on a CPU, because bf16 is many times slower there without its instructions."""
+        """The preferred precision; fp32 on a CPU, because most CPUs emulate bf16, which is many times slower."""
         if self.gpu is None:
             return "fp32"
         return "bf16" if self.has_bf16 else "fp16"
@@ -89,7 +89,7 @@ class ModelChoice:
     """The model to train: a pre-trained predictor, or a new predictor on an encoder."""
 
     path: str
-    is_scratch: bool  # whether a new predictor is trained; `path` is then that of the encoder
+    is_scratch: bool  # whether a new predictor is trained; `path` is then the path of the encoder
     sizes: ModelSizes
 
     @property
@@ -166,7 +166,7 @@ def make_draft(data: DatasetProperties, machine: Machine, model: ModelChoice, *,
         InputError: The values are not a valid config.
     """
     training = _make_training_section(data, machine, model)
-    every = max(20, min(1_000, int(plain_values(training)["steps"]) // 10))
+    validation_every = max(20, min(1_000, int(plain_values(training)["steps"]) // 10))
     values: DraftValues = {
         "run_dir": DraftValue(run_dir),
         "seed": DraftValue(0),
@@ -175,11 +175,11 @@ def make_draft(data: DatasetProperties, machine: Machine, model: ModelChoice, *,
         "adapter": _make_adapter_section(model, data),
         "training": training,
         "validation": {
-            "every": DraftValue(every, "in steps; the best checkpoint is rarely the last one"),
+            "every": DraftValue(validation_every, "in steps; the best checkpoint is rarely the last one"),
             "clips": DraftValue(64),
         },
         "checkpoint": {
-            "every": DraftValue(every),
+            "every": DraftValue(validation_every),
             "keep": DraftValue(3, "checkpoints, in addition to the best one"),
             "keep_best": DraftValue(
                 "ranking", "the prediction error may fall while planning gets worse (docs/training.md)"
@@ -196,7 +196,7 @@ def make_draft(data: DatasetProperties, machine: Machine, model: ModelChoice, *,
         return Draft(values, config, costs)
     batch, checkpointing, needed = _choose_batch(config, machine)
     verdict = "fits into" if needed <= machine.gpu_bytes else "does not fit into"
-    fitted = {
+    batch_values = {
         "batch_size": DraftValue(batch, f"{verdict} {machine.memory_text}"),
         "accumulation": DraftValue(
             _CLIPS_PER_STEP // batch, f"micro-batches per optimizer step; {_CLIPS_PER_STEP} clips per step"
@@ -205,7 +205,7 @@ def make_draft(data: DatasetProperties, machine: Machine, model: ModelChoice, *,
             checkpointing, "required to fit into memory" if checkpointing else "not required to fit into memory"
         ),
     }
-    values = {**values, "training": {**training, **fitted}}
+    values = {**values, "training": {**training, **batch_values}}
     costs.insert(0, f"Estimated peak GPU memory: {needed / GIGABYTE:.1f} GB, which {verdict} {machine.memory_text}.")
     if machine.gpu is None:
         costs.append("Run `vjepa2-ac init` on the training machine to choose batch size and precision for its GPU.")
@@ -301,7 +301,7 @@ def _make_adapter_section(model: ModelChoice, data: DatasetProperties) -> DraftV
 
 
 def _make_training_section(data: DatasetProperties, machine: Machine, model: ModelChoice) -> DraftValues:
-    """Return the section `training`, with a batch size that does not depend on the GPU yet."""
+    """Return the section `training`. `make_draft` replaces the batch size by one that fits into GPU memory."""
     batch, accumulation = (8, 1) if model.is_tiny else (4, _CLIPS_PER_STEP // 4)
     learning_rate = DraftValue(1e-4, "also try 3e-4")
     if model.is_tiny:
@@ -310,7 +310,7 @@ def _make_training_section(data: DatasetProperties, machine: Machine, model: Mod
         learning_rate = DraftValue(
             1.5e-4, "V-JEPA 2-AC's 4.25e-4 for 256 clips per step, times sqrt(32 / 256); not tested"
         )
-    weak = DraftValue(True, "accepts the tiny model, which was not trained on real images")
+    allow_weak_base = DraftValue(True, "accepts the tiny model, which was not trained on real images")
     no_gpu = "no GPU; on Ampere or newer GPUs use bf16" + ("" if model.is_tiny else " and model.dtype: bfloat16")
     precision_reason = {"fp32": no_gpu, "fp16": "this GPU does not support bf16", "bf16": ""}[machine.precision]
     return {
@@ -321,7 +321,7 @@ def _make_training_section(data: DatasetProperties, machine: Machine, model: Mod
         "learning_rate": learning_rate,
         "precision": DraftValue(machine.precision, precision_reason),
         "gradient_checkpointing": DraftValue(False),
-        **({"allow_weak_base": weak} if model.is_tiny and not model.is_scratch else {}),
+        **({"allow_weak_base": allow_weak_base} if model.is_tiny and not model.is_scratch else {}),
     }
 
 
@@ -329,8 +329,8 @@ def _choose_num_frames(data: DatasetProperties, model: ModelChoice, stride: int)
     frames = 4 if model.is_tiny else 16 if (data.episodes or 0) > _FEW_EPISODES else 8
     if data.median_steps is None or data.p10_steps is None:
         return DraftValue(frames, "per clip, one per model step")
-    longest = 1 + (min(data.median_steps // 2, data.p10_steps) - 1) // stride
-    frames = max(_MIN_FRAMES, min(longest, frames))
+    max_frames = 1 + (min(data.median_steps // 2, data.p10_steps) - 1) // stride
+    frames = max(_MIN_FRAMES, min(max_frames, frames))
     lengths = f"half of the episodes have at least {data.median_steps}, one in ten has at most {data.p10_steps}"
     return DraftValue(frames, f"a clip spans {counted((frames - 1) * stride + 1, 'control step')}; {lengths}")
 
@@ -339,7 +339,7 @@ def _choose_shares(data: DatasetProperties) -> dict[Split, DraftValue]:
     """Return the shares of validation and test; with few episodes the test share is raised for a usable interval."""
     share, test_share, reason = 0.05, 0.05, "share of the episodes, selected by a hash; at least one episode"
     if data.episodes is not None:
-        share = next(share for least, share in _SHARES if data.episodes > least or least == 0)
+        share = next(share for minimum, share in _SHARES if data.episodes > minimum or minimum == 0)
         count = max(1, round(share * data.episodes))
         required = min(_MAX_TEST_SHARE, math.ceil(100 * (MIN_EPISODES + 1) / data.episodes) / 100)
         test_share = max(share, required)

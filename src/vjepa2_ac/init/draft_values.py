@@ -1,4 +1,4 @@
-"""Config values that `init` derived from a data set, each with its reason, and their text as YAML."""
+"""Config values that `init` derived from a data set, each with a reason, and the config as YAML text."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def format_yaml(header: Sequence[str], values: DraftValues) -> str:
     for name, entry in values.items():
         if not isinstance(entry, DraftValue):
             lines.append("")
-        lines += _lines({name: entry}, "")
+        lines += _format_lines({name: entry}, "")
     return "\n".join(lines) + "\n"
 
 
@@ -59,11 +59,11 @@ def list_guesses(values: DraftValues, prefix: str = "") -> dict[str, str]:
     return texts
 
 
-def _lines(values: DraftValues, indent: str) -> Iterator[str]:
+def _format_lines(values: DraftValues, indent: str) -> Iterator[str]:
     for name, entry in values.items():
         if not isinstance(entry, DraftValue):
             yield f"{indent}{name}:"
-            yield from _lines(entry, indent + "  ")
+            yield from _format_lines(entry, indent + "  ")
             continue
         line, comment = indent + yaml_line(name, entry.value), escaped(GUESSED * entry.is_guess + entry.reason)
         yield f"{line:<{_COLUMN}}  # {comment}" if comment else line

@@ -18,7 +18,7 @@ from vjepa2_ac.init.dataset_properties import DatasetProperties, is_not_camera, 
 from vjepa2_ac.init.draft_values import DraftValue
 from vjepa2_ac.init.poses import Column, Samples, find_pose, select_measured_columns, select_vector_state
 
-_SAMPLED = 24  # episodes whose values are read to check what the column names suggest
+_NUM_SAMPLED_EPISODES = 24  # episodes whose values are read to check what the column names suggest
 _BOOKKEEPING_COLUMNS = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index", "subtask_index"})
 _DROID_GRIPPER = "observation.state.gripper_position"
 _DROID_COLUMNS = frozenset({"building", "collector_id"})  # columns of DROID's conversions to LeRobot
@@ -83,7 +83,7 @@ def _read_sampled_rows(info: DatasetInfo, columns: Mapping[str, Column]) -> Samp
         parquet_rows = ParquetRows(
             EpisodeFiles(LeRobotData(path=info.root)), list(columns), f"{first.version} {first.size}"
         )
-        for number in range(min(_SAMPLED, info.episodes)):
+        for number in range(min(_NUM_SAMPLED_EPISODES, info.episodes)):
             file = fill_template(info.data_path, number // info.chunk_episodes, number if info.version == "v2.1" else 0)
             rows = parquet_rows.read_rows(storage.join(info.root, file), number)
             for name in columns:

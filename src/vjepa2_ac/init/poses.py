@@ -20,17 +20,17 @@ Samples = Mapping[str, Sequence[Numbers]]  # values of some episodes, by column;
 Range = tuple[float, float]  # minimum and maximum
 
 _NAMES_OF_DROID = ["x", "y", "z", "roll", "pitch", "yaw"]
-_MAX_GRIPPER_M, _MAX_SHARE = 0.15, 1.05  # largest values of a gripper's opening in metres, and of a share
+_MAX_GRIPPER_M, _MAX_FRACTION = 0.15, 1.05  # largest gripper opening in metres, and as a fraction
 
-_RATE = r"vel|speed|force|torque|effort|accel|wrench|current(?!_?(?:tcp|ee|pose|cart|pos|state))"
-_NO_RATE = re.compile(_RATE, re.I)
-_NO_POSE = re.compile(rf"joint|motor|shoulder|elbow|qpos|{_RATE}", re.I)
-_NO_STATE = re.compile(r"action|timestamp|index|reward|done", re.I)
+_RATE_WORDS = r"vel|speed|force|torque|effort|accel|wrench|current(?!_?(?:tcp|ee|pose|cart|pos|state))"
+_RATE_NAME = re.compile(_RATE_WORDS, re.I)
+_NON_POSE = re.compile(rf"joint|motor|shoulder|elbow|qpos|{_RATE_WORDS}", re.I)
+_NON_STATE = re.compile(r"action|timestamp|index|reward|done", re.I)
 _NOT_MEASURED = re.compile(  # words of poses that are commanded, of another time, or relative
     r"target|cmd|command(ed)?|goal|desired|des|setpoint|action|ref(erence)?|prev(ious)?|last|next|delta|rel|relative|"
     r"err|error|start|init|initial|demo|leader|master"
 )
-_NO_HAND = re.compile(r"object|obj|cube|block|camera|cam|base|mobile|head|torso|world|tag|marker|aruco")
+_NON_HAND = re.compile(r"object|obj|cube|block|camera|cam|base|mobile|head|torso|world|tag|marker|aruco")
 _HAND = re.compile(r"|left|right|l|r|(robot|arm)_?\d*")  # names of groups that certainly belong to an end effector
 _POSE = re.compile(r"cartesian|ee_?f?(_|\.|$|pose|pos)|tcp|pose|state", re.I)
 _GRIPPER = re.compile(r"grip|finger", re.I)
@@ -74,8 +74,8 @@ class _Number:
     name: str
     kind: str  # position, gripper, quaternion, rotation (names that fit several formats), or a rotation format
     axis: str = ""  # x, y, z, w or a digit
-    group: str = ""  # the part of its name that distinguishes arms; may be empty
-    prefix: str = ""  # the part of its name before the kind
+    group: str = ""  # the part of the name that distinguishes arms; may be empty
+    prefix: str = ""  # the part of the name before the kind
     unit: str = ""
     is_named: bool = True  # False: recognised by the width of its column
 
@@ -130,7 +130,7 @@ def select_measured_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
     return {
         name: column
         for name, column in columns.items()
-        if not _NO_STATE.search(name) and not (_NO_RATE if _GRIPPER.search(name) else _NO_POSE).search(name)
+        if not _NON_STATE.search(name) and not (_RATE_NAME if _GRIPPER.search(name) else _NON_POSE).search(name)
     }
 
 
@@ -156,10 +156,10 @@ def _find_numbers(name: str, column: Column, samples: Sequence[Numbers]) -> list
     """Return the numbers in a column that may be part of a pose, by their names, or else by the column's width."""
     if len(column.names) == column.width and (column.width > 1 or not _GRIPPER.search(name)):
         numbers = _parse_names(name, column.names)
-        quaternions = [part for part in _group_axes(numbers) if len(part) == 4]
-        if not samples or all(_have_unit_norm(samples, [number.index for number in part]) for part in quaternions):
+        quaternions = [vector for vector in _group_axes(numbers) if len(vector) == 4]
+        if not samples or all(_have_unit_norm(samples, [number.index for number in vector]) for vector in quaternions):
             return numbers
-    elif any(map(_NO_POSE.search, column.names)):
+    elif any(map(_NON_POSE.search, column.names)):
         return []
     names = _propose_names(name, column.width, samples)
     is_named = len(names) == 1 or names == _NAMES_OF_DROID  # a single number is a gripper
@@ -171,7 +171,7 @@ def _parse_names(column: str, names: Sequence[str]) -> list[_Number]:
     numbers = []
     all_words = [_to_snake_case(name) for name in names]
     has_rates = any(re.search(r"(?:^|_)v[xyz]$", words) for words in all_words)
-    has_six = any(re.search(r"(?:^|_)(?:r|rot|rotation)_?[4-9]$", words) for words in all_words)
+    has_matrix = any(re.search(r"(?:^|_)(?:r|rot|rotation)_?[4-9]$", words) for words in all_words)
     for index, (name, words) in enumerate(zip(names, all_words, strict=True)):
         head, _, unit = words.rpartition("_")
         words = head if unit in _UNITS else words
@@ -180,8 +180,8 @@ def _parse_names(column: str, names: Sequence[str]) -> list[_Number]:
         if kind == "euler_xyz" and unit.startswith("deg"):
             kind = "euler_xyz_degrees"
         is_rate = has_rates and re.search(r"(?:^|_)w[xyz]$", words)  # next to a velocity: an angular velocity
-        is_of_six = has_six and kind == "rotation"  # six numbers of a rotation matrix
-        if kind and not is_rate and not is_of_six:
+        is_matrix_entry = has_matrix and kind == "rotation"  # six numbers of a rotation matrix
+        if kind and not is_rate and not is_matrix_entry:
             group = _find_group(f"{_to_snake_case(column)}_{prefix}")
             numbers.append(_Number(column, index, name, kind, axis, group, prefix, unit))
     return numbers
@@ -190,9 +190,9 @@ def _parse_names(column: str, names: Sequence[str]) -> list[_Number]:
 def _parse_kind(words: str) -> tuple[str, str, str]:
     """Return kind, axis and prefix of a number from its name in snake case; an empty kind means no part of a pose."""
     if _GRIPPER.search(words):
-        return ("", "", "") if _NO_RATE.search(words) else ("gripper", "", words.rstrip("0123456789"))
+        return ("", "", "") if _RATE_NAME.search(words) else ("gripper", "", words.rstrip("0123456789"))
     words = re.sub(r"_(?:pos|position)$", "", words)
-    if not _NO_POSE.search(words):
+    if not _NON_POSE.search(words):
         for kind, pattern in _KINDS:
             if match := re.search(pattern, words):
                 return kind, _AXES.get(match[1], match[1]), words[: match.start()]
@@ -233,34 +233,34 @@ _Numbers = tuple[_Number, ...]  # a candidate: position (3), rotation (3 or 4), 
 
 def _group_axes(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
     """Yield positions and rotations: the numbers of one arm, column and kind in the order of their axes, w last."""
-    parts: dict[tuple[str, str, str, str], dict[str, _Number]] = {}
+    vectors: dict[tuple[str, str, str, str], dict[str, _Number]] = {}
     for number in numbers:
         key = number.group, number.column, number.kind, number.prefix
-        parts.setdefault(key, {}).setdefault(number.axis, number)
-    for (_, _, kind, _), by_axis in parts.items():
+        vectors.setdefault(key, {}).setdefault(number.axis, number)
+    for (_, _, kind, _), by_axis in vectors.items():
         if len(by_axis) in _NUM_AXES.get(kind, (3,)):
             yield tuple(by_axis[axis] for axis in "01234xyzw" if axis in by_axis)
 
 
 def _find_candidates(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
     """Yield position, rotation and gripper of each arm."""
-    parts, all_grippers = list(_group_axes(numbers)), [number for number in numbers if number.kind == "gripper"]
-    positions = [part for part in parts if part[0].kind == "position"]
-    for position in (part for part in positions if not any(map(_NO_HAND.fullmatch, part[0].group.split("_")))):
+    vectors, all_grippers = list(_group_axes(numbers)), [number for number in numbers if number.kind == "gripper"]
+    positions = [vector for vector in vectors if vector[0].kind == "position"]
+    for position in (vector for vector in positions if not any(map(_NON_HAND.fullmatch, vector[0].group.split("_")))):
         group, column = position[0].group, position[0].column
-        rotations = [part for part in parts if part[0].kind != "position" and part[0].group == group]
+        rotations = [vector for vector in vectors if vector[0].kind != "position" and vector[0].group == group]
         grippers = [number for number in all_grippers if number.group in {group, ""} or len(all_grippers) == 1]
         if rotations and grippers:
             rotation = min(
                 rotations,
-                key=lambda part: (part[0].column != column, _may_be_rate(part[0]), part[0].kind not in FORMATS),
+                key=lambda vector: (vector[0].column != column, _may_be_rate(vector[0]), vector[0].kind not in FORMATS),
             )
             gripper = min(grippers, key=lambda number: (number.group != group, number.column != column))
             yield (*position, *rotation, gripper)
 
 
 def _may_be_rate(number: _Number) -> bool:
-    """Return whether a number is called wx, wy or wz: an angular velocity, or a rotation vector if nothing else is."""
+    """Return whether a number is named wx, wy or wz, which is an angular velocity or part of a rotation vector."""
     return re.search(r"(?:^|_)w[xyz]$", _to_snake_case(number.name)) is not None
 
 
@@ -276,7 +276,7 @@ def _is_not_measured(candidate: _Numbers) -> bool:
 
 
 def _list_unused(chosen: _Numbers, numbers: Sequence[_Number]) -> list[str]:
-    """Return the names of the unused numbers of other arms, of commands, and of the same columns."""
+    """Return the names of the numbers of other poses: of other arms, of commands, and in the same columns."""
     columns, group = {number.column for number in chosen}, chosen[0].group
     remaining = [
         number for number in numbers if number not in chosen and (number.group != group or number.column in columns)
@@ -294,8 +294,8 @@ def _make_pose_values(
 ) -> dict[str, DraftValue]:
     """Return the config keys that select the chosen numbers, with formats that were checked with the samples."""
     pose_columns = list(dict.fromkeys(number.column for number in chosen))
-    concatenated = [(name, index) for name in pose_columns for index in range(columns[name].width)]
-    select = [concatenated.index((number.column, number.index)) for number in chosen]
+    column_numbers = [(name, index) for name in pose_columns for index in range(columns[name].width)]
+    select = [column_numbers.index((number.column, number.index)) for number in chosen]
     unnamed_columns = [columns[number.column] for number in chosen if not number.is_named]
     group = chosen[0].group
     doubts = []
@@ -318,7 +318,7 @@ def _make_pose_values(
     reason = ". ".join([reason, *doubts])
     is_guess = bool(unnamed_columns or doubts)
     keys = {"state": DraftValue(pose_columns, reason, is_guess)}
-    if select != list(range(len(concatenated))):
+    if select != list(range(len(column_numbers))):
         keys["select"] = DraftValue(select, "indices of the pose's numbers in the columns of state", is_guess)
     keys["rotation"] = _choose_rotation_format(chosen[3:-1], samples, control_rate_hz)
     unit = _choose_position_unit(chosen[:3], samples)
@@ -326,7 +326,7 @@ def _make_pose_values(
 
 
 def _get_finite_values(numbers: _Numbers, samples: Samples) -> list[Numbers]:
-    """Return the finite sampled values of some numbers of one column, for each episode; empty if it was not read."""
+    """Return the finite sampled values of numbers of one column, by episode; empty if the column was not read."""
     indexes = [number.index for number in numbers]
     episodes = [episode[:, indexes] for episode in samples.get(numbers[0].column, ())]
     return [finite for episode in episodes if len(finite := episode[np.isfinite(episode).all(axis=1)])]
@@ -382,20 +382,20 @@ def _choose_position_unit(position: _Numbers, samples: Samples) -> DraftValue:
 # ---- the gripper ----
 
 
-def guess_gripper_values(name: str, ranges: Range | None) -> dict[str, DraftValue]:
+def guess_gripper_values(name: str, value_range: Range | None) -> dict[str, DraftValue]:
     """Return the values of the open and the closed gripper, guessed from its name and the range of its values.
 
     Args:
         name: Name of the gripper's number in the data set.
-        ranges: Minimum and maximum of its values; None: unknown.
+        value_range: Minimum and maximum of the gripper's values; None: unknown.
     """
     opened, closed, reason = 0.0, 1.0, "the range of the gripper's values is unknown"
-    if ranges is not None:
-        low, high = ranges
+    if value_range is not None:
+        low, high = value_range
         reason = f"the gripper's values range from {low:.3g} to {high:.3g}"
         if 0 < max(abs(low), abs(high)) <= _MAX_GRIPPER_M:
             opened, closed, reason = round(high if high > -low else low, 4), 0.0, f"{reason}: probably metres"
-        elif high > _MAX_SHARE:
+        elif high > _MAX_FRACTION:
             opened, closed, reason = round(high, 1), max(0.0, round(low, 1)), f"{reason}: probably a width or percent"
         elif low < -0.5:
             opened, closed, reason = -1.0, 1.0, f"{reason}: probably -1 open, 1 closed"
@@ -403,7 +403,7 @@ def guess_gripper_values(name: str, ranges: Range | None) -> dict[str, DraftValu
     if len(words) == 1:
         low, high = sorted((opened, closed))
         opened, closed = (high, low) if words == {"open"} else (low, high)
-        if ranges is not None and (low, high) == (0.0, 1.0):
+        if value_range is not None and (low, high) == (0.0, 1.0):
             return {
                 "gripper_open": DraftValue(opened, f"recognised by the name {name}"),
                 "gripper_closed": DraftValue(closed),

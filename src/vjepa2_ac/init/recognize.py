@@ -77,14 +77,12 @@ def read_npz_properties(path: str) -> DatasetProperties:
             raise InputError(where=where, found=arrays or "no arrays", needed=needed, fix=FORMAT_HELP)
         rate = float(np.asarray(file.read_array("fps_hz")).reshape(-1)[0])
     steps, width = headers["states"].shape
-    first = "frames" if "frames" in cameras else pick_camera(cameras)
-    is_pose, has_several = width == STATE_DIM, len(cameras) > 1
+    camera = "frames" if "frames" in cameras else pick_camera(cameras)
+    is_pose, is_guess = width == STATE_DIM, len(cameras) > 1
     return DatasetProperties(
         source="npz",
         path=path,
-        config_values={
-            "camera": DraftValue(first, f"cameras: {', '.join(cameras)}" if has_several else "", is_guess=has_several)
-        },
+        config_values={"camera": DraftValue(camera, f"cameras: {', '.join(cameras)}" if is_guess else "", is_guess)},
         rate_hz=DraftValue(rate, f"read from {files[0]}"),
         states="pose" if is_pose else "vector",
         episodes=len(files),
@@ -144,8 +142,8 @@ _CONVERSION_HELP = {  # advice for other formats, by file suffix
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 _VERSION = re.compile(r"\d+(\.\d+)*")  # name of a version folder of TFDS
 _UNKNOWN_RATE = "not stored in the data set. Enter the number of control steps per second of your robot"
-_DEEPEST = 2  # levels of subfolders that are searched for a description file
-_MOST_FOLDERS = 50  # subfolders of each folder that are searched
+_MAX_DEPTH = 2  # levels of subfolders that are searched for a description file
+_MAX_FOLDERS = 50  # subfolders of each folder that are searched
 
 
 def read_properties(path: str) -> DatasetProperties:
@@ -169,7 +167,7 @@ def read_properties(path: str) -> DatasetProperties:
         described = _find_described_sets(path)
         if not described:
             return _READERS[_recognize_format(path)](path)
-        form, newest, versions = _require_only_set(described, path)
+        form, newest, versions = _require_single_set(described, path)
         data = _READERS[form](newest)
         version_note = f"version {_last_name(newest)}, the newest of {', '.join(versions)}"
         return replace(data, descriptions=(*data.descriptions, *[version_note] * (len(versions) > 1)))
@@ -180,7 +178,7 @@ def _read_with_plugins(path: str) -> DatasetProperties | None:
     accept_new_data_formats(all_installed=True)
     for source, kind in DataConfig.kinds.items():
         if (values := kind.detect(path)) is not None:
-            reason = f"returned by {kind.__name__}.look"
+            reason = f"returned by {kind.__name__}.detect"
             rate = DraftValue(10.0, _UNKNOWN_RATE, is_guess=True)
             if "control_rate_hz" in values:
                 rate = DraftValue(values.pop("control_rate_hz"), reason)
@@ -208,26 +206,26 @@ def _find_described_sets(path: str) -> list[tuple[str, str]]:
     """
     described: dict[str, tuple[str, str]] = {}  # by absolute path, because several links may lead to one data set
     folders = [path]
-    for depth in range(_DEEPEST + 2):
+    for depth in range(_MAX_DEPTH + 2):
         listings = zip(folders, map_in_threads(storage.list_folder, folders, _CONNECTIONS), strict=True)
         folders = []
         for folder, entries in listings:
             names = {entry.name for entry in entries}
-            marked = [form for form, mark in _DESCRIPTION_FILES.items() if mark.partition("/")[0] in names]
+            candidates = [form for form, file in _DESCRIPTION_FILES.items() if file.partition("/")[0] in names]
             if form := next(
-                (form for form in marked if storage.exists(storage.join(folder, _DESCRIPTION_FILES[form]))), None
+                (form for form in candidates if storage.exists(storage.join(folder, _DESCRIPTION_FILES[form]))), None
             ):
                 described.setdefault(storage.canonical_path(folder), (form, folder))
                 continue
             subfolders = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
-            if depth == _DEEPEST:
+            if depth == _MAX_DEPTH:
                 subfolders = [name for name in subfolders if _VERSION.fullmatch(name)]
-            folders += [storage.join(folder, name) for name in sorted(subfolders, key=_as_version)[-_MOST_FOLDERS:]]
+            folders += [storage.join(folder, name) for name in sorted(subfolders, key=_as_version)[-_MAX_FOLDERS:]]
     return list(described.values())
 
 
-def _require_only_set(described: Sequence[tuple[str, str]], path: str) -> tuple[str, str, list[str]]:
-    """Return format and folder of the newest version of the only data set, and the names of all its versions.
+def _require_single_set(described: Sequence[tuple[str, str]], path: str) -> tuple[str, str, list[str]]:
+    """Return format and folder of the newest version of the only data set, and the names of all versions.
 
     Raises:
         InputError: There are several data sets. The error lists their folders.
@@ -238,7 +236,7 @@ def _require_only_set(described: Sequence[tuple[str, str]], path: str) -> tuple[
         sets.setdefault(folder.rpartition("/")[0] if is_version else folder, []).append((form, folder))
     if len(sets) > 1:
         problem = f"{len(sets)} data sets: {', '.join(sorted(sets))}"
-        fix = f"Pass the path of one of them, for example `{shell_command('init', min(sets))}`"
+        fix = f"Pass the path of one data set, for example `{shell_command('init', min(sets))}`"
         raise InputError(where=path, found=problem, needed="exactly one data set", fix=fix)
     versions = sorted(*sets.values(), key=lambda version: _as_version(_last_name(version[1])))
     return *versions[-1], [_last_name(folder) for _, folder in versions]
@@ -259,7 +257,7 @@ def _recognize_format(path: str) -> str:
     Raises:
         InputError: No format is recognised.
     """
-    names = _names_below(path)
+    names = _list_names(path)
     if any(name.endswith(".npz") for name in names):
         return "npz"
     if any(name == "trajectory.h5" or name.startswith("metadata_") for name in names):
@@ -273,7 +271,7 @@ def _recognize_format(path: str) -> str:
     raise InputError(where=path, found=f"no supported data format ({shown})", needed=needed, fix=fix)
 
 
-def _names_below(path: str) -> list[str]:
+def _list_names(path: str) -> list[str]:
     """Return the names of files and folders at a path, in its first subfolder, and so on, up to five levels."""
     names: list[str] = []
     for _ in range(5):

@@ -35,7 +35,7 @@ _BRIDGE_POSE = {
 }
 _DROID_RATE_HZ, _BRIDGE_RATE_HZ, _UNKNOWN_RATE_HZ = 15.0, 5.0, 10.0
 _VELOCITIES = "steps/action_dict/joint_velocity"
-_SAMPLED = 24  # number of records whose values are read to check what the column names suggest
+_NUM_SAMPLED_RECORDS = 24  # number of records whose values are read to check what the column names suggest
 _NUMBER_DTYPES = ("float", "int", "uint", "bool")
 _ALL_KINDS: tuple[Kind, ...] = ("bytes_list", "float_list", "int64_list")
 _PATHS = frozenset({"file_path", "episode_id", "recording_folderpath"})
@@ -79,7 +79,7 @@ def read_rlds_properties(path: str) -> DatasetProperties:
     is_bridge = name in _BRIDGE_NAMES and _BRIDGE_FEATURE in features
     rate = _choose_control_rate(features, is_bridge=is_bridge)
     has_velocities = _VELOCITIES in features
-    texts = [name for name, feature in features.items() if feature.kind == "text"]
+    text_features = [name for name, feature in features.items() if feature.kind == "text"]
     columns = {
         name: Column(feature.width)
         for name, feature in features.items()
@@ -111,7 +111,7 @@ def read_rlds_properties(path: str) -> DatasetProperties:
                 **(pose or select_vector_state(columns, where)),
                 "identity": _choose_identity(records, episode_texts),
                 "cameras": all_cameras,
-                "language": DraftValue(next((name for name in texts if "instruction" in name), None)),
+                "language": DraftValue(next((name for name in text_features if "instruction" in name), None)),
                 "joint_velocity": DraftValue(_VELOCITIES if has_velocities else None),
                 "control_rate_hz": rate,
             },
@@ -143,7 +143,7 @@ def make_droid_properties(path: str, episodes: int, title: str) -> DatasetProper
 
 
 def _choose_control_rate(features: Mapping[str, _Feature], *, is_bridge: bool) -> DraftValue:
-    """Return the control rate, which RLDS does not store: it is known only for known data sets, otherwise a guess."""
+    """Return the control rate of a known data set, or else a guess, because RLDS does not store the rate."""
     if is_bridge:
         return DraftValue(_BRIDGE_RATE_HZ, "BridgeData's control rate, which RLDS does not store")
     if _DROID_FEATURE in features:
@@ -151,7 +151,7 @@ def _choose_control_rate(features: Mapping[str, _Feature], *, is_bridge: bool) -
         return DraftValue(_DROID_RATE_HZ, reason, is_guess=True)
     return DraftValue(
         _UNKNOWN_RATE_HZ,
-        "RLDS does not store it. Enter the number of control steps per second of your robot",
+        "RLDS does not store the control rate. Enter the number of control steps per second of your robot",
         is_guess=True,
     )
 
@@ -160,7 +160,7 @@ def _read_features(path: str) -> Iterator[tuple[str, _Feature]]:
     """Yield the features of an RLDS data set with their names in a record.
 
     Raises:
-        InputError: features.json does not exist or is no valid description.
+        InputError: features.json does not exist or is not a valid description.
     """
     where = storage.join(path, "features.json")
     try:
@@ -170,20 +170,20 @@ def _read_features(path: str) -> Iterator[tuple[str, _Feature]]:
         needed = "a feature description written by TFDS"
         raise InputError(where=where, found="no such file", needed=needed, fix=fix) from None
     try:
-        yield from _nested_features(content, "")
+        yield from _iterate_features(content, "")
     except (AttributeError, TypeError, ValueError) as error:
         problem = f"an invalid feature description ({error})"
         raise InputError(where=where, found=problem, needed="a feature description written by TFDS") from None
 
 
-def _nested_features(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
+def _iterate_features(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
     if not isinstance(content, Mapping):
         return
     if "featuresDict" in content:
         for key, feature in dict(content["featuresDict"].get("features", {})).items():
-            yield from _nested_features(feature, f"{name}/{key}" if name else key)
+            yield from _iterate_features(feature, f"{name}/{key}" if name else key)
     elif "sequence" in content:
-        yield from _nested_features(content["sequence"].get("feature"), name)
+        yield from _iterate_features(content["sequence"].get("feature"), name)
     else:
         kind = next((kind for kind in ("image", "text", "tensor") if kind in content), "")
         description = content.get(kind) or {}
@@ -213,10 +213,10 @@ def _sample_records(shards: Sequence[Shard], names: Sequence[str]) -> list[dict[
     """
     records: list[dict[str, tuple[Any, ...]]] = []
     with suppress(UserError, OSError):
-        for shard in shards[:_SAMPLED]:
+        for shard in shards[:_NUM_SAMPLED_RECORDS]:
             with open_shard(shard) as read:
                 offset = 0
-                for number in range(min(shard.episodes, -(-_SAMPLED // len(shards)))):
+                for number in range(min(shard.episodes, -(-_NUM_SAMPLED_RECORDS // len(shards)))):
                     span = parse_header(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
                     record, offset = Record(read, span), span.end
                     present = [name for name in names if name in record.feature_ranges]

@@ -1,4 +1,4 @@
-"""Action prior: predicts the next action from the current latents, the goal's latents and the remaining steps.
+"""Action prior: predict the next action from the current latents, the goal's latents and the number of steps left.
 
 Source of the idea: arXiv 2605.08732 (GC-IDM, goal-conditioned inverse dynamics): hindsight goals from demonstrations,
 and adaptive layer norms conditioned on the remaining steps. Positions in an image are computed by a spatial softmax
@@ -113,18 +113,18 @@ class ActionPrior(nn.Module):
         """Return mean and mean absolute deviation of the next action, in units of `scale`."""
         frame_features, goal_features = self._extract_features(frame), self._extract_features(goal)
         x = self.inner(torch.cat([frame_features, goal_features, goal_features - frame_features, state], dim=1))
-        parts = self.remaining(remaining.clamp(0, self.sizes.ahead)).unflatten(1, (BLOCKS, 2, WIDTH))
+        modulation = self.remaining(remaining.clamp(0, self.sizes.ahead)).unflatten(1, (BLOCKS, 2, WIDTH))
         for number, block in enumerate(self.blocks):
-            x = x + gelu(block(self.norm(x) * (1 + parts[:, number, 0]) + parts[:, number, 1]))
+            x = x + gelu(block(self.norm(x) * (1 + modulation[:, number, 0]) + modulation[:, number, 1]))
         mean, log_deviation = self.outer(self.norm(x)).chunk(2, dim=1)
         return mean, log_deviation.clamp(-5.0, 3.0).exp()
 
     def _extract_features(self, latents: Float[Tensor, "batch tokens dim"]) -> Float[Tensor, "batch numbers"]:
         """Return the positions of `POINTS` points in an image (spatial softmax), and features at these points."""
         features = gelu(self.features(latents))
-        shares = self.places(features).softmax(dim=1)
-        points = torch.einsum("bnk,nc->bkc", shares, self.grid)
-        values = torch.einsum("bnk,bnv->bkv", shares, self.values(features))
+        weights = self.places(features).softmax(dim=1)
+        points = torch.einsum("bnk,nc->bkc", weights, self.grid)
+        values = torch.einsum("bnk,bnv->bkv", weights, self.values(features))
         return torch.cat([points, values], dim=2).flatten(1)
 
     @torch.no_grad()
@@ -152,7 +152,7 @@ class ActionPrior(nn.Module):
     def make_start(
         self, cost: WorldModelCost, goal: Float[Tensor, "tokens dim"], remaining: int, space: SearchSpace
     ) -> PlanStart:
-        """Return the start of a search: the prior's actions along its own rollout in the world model.
+        """Return the start of a search: actions that the prior predicts along a rollout of the world model.
 
         The first action is predicted from the current frame, each further action from the predicted frame before it.
 
@@ -165,11 +165,11 @@ class ActionPrior(nn.Module):
         frame, state = cost.current
         decisions, spread = torch.zeros_like(space.lower), torch.zeros_like(space.lower)
         for number in range(space.decisions):
-            done = number * space.repeat
-            if done:
+            step = number * space.repeat
+            if step:
                 predicted, states = cost.rollout(space.repeat_over_steps(space.clip(decisions))[None])
-                frame, state = predicted[0, done - 1], states[0, done]
-            decisions[number], spread[number] = self.predict_action(frame, state, goal, remaining - done)
+                frame, state = predicted[0, step - 1], states[0, step]
+            decisions[number], spread[number] = self.predict_action(frame, state, goal, remaining - step)
         return PlanStart(decisions, decisions[None], spread)
 
 
@@ -202,7 +202,7 @@ def load_prior_for_planning(path: str, known: Fingerprints, cameras: Cameras) ->
     """Load `planning.prior` on the device of the model, and return its function for the start of a search.
 
     Raises:
-        InputError: As `load_prior`; or the prior was trained with another encoder or crop.
+        InputError: The prior cannot be read, or was trained with another encoder or crop.
     """
     card, prior = load_prior(path, where="planning.prior")
     for name, trained, model in (("encoder", card.encoder, known.encoder), ("data.crop", card.crop, cameras.crop)):
@@ -213,7 +213,7 @@ def load_prior_for_planning(path: str, known: Fingerprints, cameras: Cameras) ->
 
 
 _NUM_SCALE_BATCHES = 8  # number of batches from which the scale of the actions is computed
-_WARM_UP, _CLIP, _NUM_HELD_OUT = 50, 1.0, 256
+_WARM_UP, _MAX_GRADIENT_NORM, _NUM_HELD_OUT = 50, 1.0, 256  # optimizer steps, norm, clips
 
 
 @dataclass(frozen=True)
@@ -249,8 +249,8 @@ def train_prior(
         reporter: Shows the progress.
 
     Returns:
-        The card of the prior. On held-out clips it has the error of the predicted mean relative to the zero action's,
-        for true goals and for goals of other clips. If both errors are equal, the prior ignores the goal.
+        The card of the prior. It contains the error of the predicted mean on held-out clips, relative to the zero
+        action's, for true goals and for goals of other clips. If both errors are equal, the prior ignores the goal.
 
     Raises:
         InputError: The data or the model cannot be used, or the loss is not finite.
@@ -289,7 +289,7 @@ def _train(
     generator, spaces = torch.Generator().manual_seed(config.seed), dataset.spaces
     progress, steps = reporter.task("training the prior", "steps"), options.steps
     with closing(training_loader(dataset, seed=config.seed, batch_size=options.batch_size)) as batches:
-        first = [
+        first_batches = [
             _draw_pairs(clips, spaces, generator)
             for clips in itertools.islice(_encode_batches(batches, model), _NUM_SCALE_BATCHES)
         ]
@@ -299,18 +299,18 @@ def _train(
             ahead = dataset.config.frames - 1
             sizes = PriorSizes(grid, model.latent_dim, widths.state, widths.action, ahead)
             prior = ActionPrior(sizes).to(model.device)
-        prior.scale.copy_(torch.cat([batch.changes for batch in first]).std(dim=0).clamp(min=1e-6))
+        prior.scale.copy_(torch.cat([batch.changes for batch in first_batches]).std(dim=0).clamp(min=1e-6))
         optimizer = torch.optim.AdamW(prior.parameters(), lr=options.learning_rate, weight_decay=0.01)
         pairs = (_draw_pairs(clips, spaces, generator) for clips in _encode_batches(batches, model))
-        for step, batch in enumerate(itertools.islice(itertools.chain(first, pairs), steps), start=1):
+        for step, batch in enumerate(itertools.islice(itertools.chain(first_batches, pairs), steps), start=1):
             for group in optimizer.param_groups:
-                share = min(1.0, step / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * (step - 1) / steps))
-                group["lr"] = share * options.learning_rate
+                factor = min(1.0, step / _WARM_UP) * 0.5 * (1 + math.cos(math.pi * (step - 1) / steps))
+                group["lr"] = factor * options.learning_rate
             mean, deviation = prior(batch.frame, batch.goal, batch.remaining, batch.states)
             loss = prior_loss(mean, deviation, batch.changes / prior.scale)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]  # torch
-            norm = torch.nn.utils.clip_grad_norm_(prior.parameters(), _CLIP)
+            norm = torch.nn.utils.clip_grad_norm_(prior.parameters(), _MAX_GRADIENT_NORM)
             if not math.isfinite(float(norm)):
                 problem = f"the loss of step {step} is not finite"
                 raise InputError(
@@ -331,7 +331,7 @@ def prior_loss(mean: Tensor, deviation: Tensor, changes: Tensor) -> Tensor:
 
 
 def _encode_batches(batches: Iterator[Batch], model: WorldModel) -> Iterator[LatentBatch]:
-    """Yield clips as latents; batches of which no clip could be read are left out."""
+    """Yield batches of clips as latents. Batches without any readable clip are left out."""
     for batch in batches:
         if len(batch.episode_ids):
             yield encode_batch(model, batch, device=model.device)
@@ -353,7 +353,7 @@ def _draw_pairs(clips: LatentBatch, spaces: Spaces, generator: torch.Generator) 
 def _measure(dataset: Dataset, model: WorldModel, prior: ActionPrior, spaces: Spaces) -> dict[str, Any]:
     """Measure the error of the predicted mean on held-out clips, relative to the zero action's.
 
-    It is measured with true goals and with goals of other clips. Empty: there are no held-out clips.
+    The error is measured with true goals and with goals of other clips. Without held-out clips the result is empty.
     """
     generator, size = torch.Generator().manual_seed(0), spaces.action.size_axes
     errors: dict[str, list[Tensor]] = {"true_goals": [], "goals_of_others": [], "zero_action": []}

@@ -56,7 +56,7 @@ class Monitor:
         """Return the surprise of a frame, given its prediction."""
         errors = mean_difference(predicted, observed).float().cpu()
         score = float(compute_surprise(errors, torch.tensor(self.expected)))
-        return Surprise(score, errors, not score <= self.threshold)  # NaN is an alarm, too
+        return Surprise(score, errors, not score <= self.threshold)  # NaN is also an alarm
 
     @classmethod
     def read(cls, path: str | Path, known: Fingerprints, *, tokens: int, where: str) -> Monitor:
@@ -86,7 +86,7 @@ def load_monitor_for_planning(path: str, known: Fingerprints, cameras: Cameras) 
     """Read `planning.monitor`, and return its function that compares a frame with its prediction.
 
     Raises:
-        InputError: As `Monitor.read`.
+        InputError: The file cannot be read, or was calibrated for another model.
     """
     return Monitor.read(path, known, tokens=cameras.model.num_tokens, where="planning.monitor").compare
 
@@ -143,10 +143,10 @@ def measure_episodes(
     Raises:
         InputError: An episode cannot be read.
     """
-    config, chosen = dataset.config, list(episodes)
+    config, indices = dataset.config, list(episodes)
     pairs = replace(dataset, config=config.model_copy(update={"camera": config.cameras[0]})).with_frames(2)
     stride = config.model_stride
-    for done, index in enumerate(chosen, start=1):
+    for done, index in enumerate(indices, start=1):
         length = len(dataset.source.read(index).states)
         starts = range(0, length - stride, stride)
         errors = []
@@ -158,18 +158,18 @@ def measure_episodes(
         if errors:
             all_errors = torch.cat(errors).double().numpy()
             yield EpisodeErrors(dataset.table.identity(index), np.array(starts) + stride, all_errors)
-        progress(done, len(chosen))
+        progress(done, len(indices))
 
 
 def calibrate_monitor(
     model: WorldModel, dataset: Dataset, false_alarms: float, progress: Progress = no_progress
 ) -> Monitor:
-    """Calibrate a monitor on held-out episodes for a largest share of false alarms.
+    """Calibrate a monitor on held-out episodes, so that false alarms do not exceed a given rate.
 
     Args:
         model: The model, merged and in eval mode.
-        dataset: The data set, of which up to 200 validation and test episodes are used.
-        false_alarms: Largest share of undisturbed episodes with an alarm.
+        dataset: The data set. At most 200 validation and test episodes are used.
+        false_alarms: Maximum fraction of undisturbed episodes with an alarm.
         progress: Called with (done, total) in episodes.
 
     Raises:

@@ -1,7 +1,7 @@
 """Offline comparison of policies: the energy of their action chunks at frames of held-out episodes.
 
 The goal of a chunk is the demonstration's frame the same number of model steps later. A policy that imitates the
-demonstration therefore scores well; the score does not show if a policy finds a better solution.
+demonstration therefore scores well. The score does not show whether a policy finds a better solution.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ def score_policies(
     Args:
         controller: The controller of the model that scores; its goals are replaced.
         dataset: The data set with the episodes.
-        policies: One or more.
+        policies: One or more policies.
         form: Meaning of the numbers of the chunks.
         control_steps: Chunk steps per model step; None: the stride of the data.
         progress: Called with (done, total) in evaluation points.
@@ -206,26 +206,32 @@ def score_policies(
         needed = f"{counted(goal_distance, 'control step')} after the frame in the same episode"
         raise InputError(where="--policy", found="no evaluation point whose episode is long enough", needed=needed)
     rng, ids = np.random.default_rng(0), [point.point[0] for point in points]
-    rows = [{point: row for row, point in reversed([*enumerate(policy.points)])} for policy in policies]
+    chunk_indices = [{point: index for index, point in reversed([*enumerate(policy.points)])} for policy in policies]
     energies: list[np.ndarray] = []
     for number, point in enumerate(points):
         alternatives = [points[index].changes for index in _draw_alternatives(rng, number, ids)]
         chunks = [
             changes_of_chunks(
-                policy.chunks[row[point.point]], point.state, form=form, control_steps=control_steps, space=space
+                policy.chunks[indices[point.point]], point.state, form=form, control_steps=control_steps, space=space
             )[:, : len(point.changes)]
-            for policy, row in zip(policies, rows, strict=True)
+            for policy, indices in zip(policies, chunk_indices, strict=True)
         ]
         step = point.point[1]
         frame, goal = read_views(dataset, point.episode, views, [step, step + goal_distance])
         controller.reset(goal)
         scores = controller.score(frame, point.state, np.concatenate([point.changes[None], alternatives, *chunks]))
-        true, alternative, proposed = np.split(scores.energies, [1, 1 + len(alternatives)])
-        by_policy = np.split(proposed, np.cumsum([len(policy_chunks) for policy_chunks in chunks])[:-1])
-        means = [float(chunk_energies.mean()) for chunk_energies in by_policy]
-        lowest = [float(chunk_energies.min()) for chunk_energies in by_policy]
-        share_below_true = float((alternative < true).mean())
-        energies.append(np.array([scores.zero_action_energy, true[0], share_below_true, *means, *lowest]))
+        demonstrated_energy, alternative_energies, proposed_energies = np.split(
+            scores.energies, [1, 1 + len(alternatives)]
+        )
+        energies_by_policy = np.split(
+            proposed_energies, np.cumsum([len(policy_chunks) for policy_chunks in chunks])[:-1]
+        )
+        means = [float(chunk_energies.mean()) for chunk_energies in energies_by_policy]
+        lowest = [float(chunk_energies.min()) for chunk_energies in energies_by_policy]
+        share_below_true = float((alternative_energies < demonstrated_energy).mean())
+        energies.append(
+            np.array([scores.zero_action_energy, demonstrated_energy[0], share_below_true, *means, *lowest])
+        )
         progress(number + 1, len(points))
     zero_action, demonstrated, shares_below_true, *policy_energies = np.stack(energies).T
     return PolicyScores(

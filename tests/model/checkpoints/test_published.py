@@ -178,7 +178,7 @@ def test_download_prints_the_kind_of_file_and_its_config_key(
     assert main(["download", "made-up", "--url", serve(Behaviour())]) == 0
     output = capsys.readouterr().out
     assert "made-up: encoder" in output
-    assert "102,400 bytes\nLicence of the test" in output
+    assert "102,400 bytes\nLicence: of the test" in output
     assert output.endswith("model.encoder.path: checkpoints/made-up.pt\n")
     assert Path("checkpoints", MADE_UP.file).read_bytes() == CONTENT
 
