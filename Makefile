@@ -25,7 +25,7 @@ $(INSTALLED): $(SIMULATION)
 demo: $(SIMULATION)  ## a simulated arm, a tiny world model, a LoRA adapter, and whether it helped
 	$(BIN)/vjepa2-ac demo
 
-# On all cores (8 at most), a thread each.
+# On all cores, at most 8, with one thread per process.
 PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -q -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 10
 
 test: $(INSTALLED)  ## the test suite; a folder in one process: .venv/bin/pytest tests/data
@@ -38,10 +38,10 @@ $(CLUSTER): $(INSTALLED)
 	$(PIP) -e ".[cluster]"
 	touch $@
 
-cluster: $(CLUSTER)  ## the tests of encode --engine ray, which installs 600 MB
+cluster: $(CLUSTER)  ## the tests of encode --engine ray; installs 600 MB
 	OMP_NUM_THREADS=1 $(BIN)/pytest -q tests/encoding/test_ray_engine.py
 
-# There is no CPU wheel of PyTorch 2.11. The one with CUDA takes 5 GB and runs without a GPU, too.
+# PyTorch 2.11 has no CPU wheel. The CUDA wheel takes 5 GB and also runs without a GPU.
 $(OLDEST)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(OLDEST)
 	grep -v -e '^torch==' -e '^transformers==' -e '^tokenizers==' -e '^huggingface_hub==' -e '^setuptools==' constraints.txt > $(OLDEST)/constraints.txt
@@ -53,7 +53,7 @@ test-oldest: $(OLDEST)/installed  ## model, runs, training and planning with the
 	OMP_NUM_THREADS=1 $(OLDEST)/bin/pytest -q -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder \
 		tests/model tests/distributed tests/runs tests/encoding tests/planning tests/training tests/export
 
-# The programs of a folder import one another by their bare names.
+# The programs of a folder import each other without a package name, so mypy needs the folder in its path.
 PROGRAM_TYPES := $(BIN)/mypy --follow-imports=silent --no-warn-return-any --allow-untyped-calls --no-warn-unused-ignores
 
 lint: $(INSTALLED)  ## style, types, spelling, language and notebooks; needs no network

@@ -2,8 +2,8 @@
 
     python examples/finetune.py [DATA] [key=value ...]
 
-Without DATA, a folder of DROID's RLDS form, a few episodes of the simulated arm are recorded first. Any knob of a
-config can be changed, such as training.steps=400 or run_dir=demo/examples/other. Started again, the run resumes.
+DATA is a folder in DROID's RLDS format. Without it, a few episodes of the simulated arm are recorded first. Any config
+key can be set, such as training.steps=400 or run_dir=demo/examples/other. Started again, the run resumes.
 """
 
 import sys
@@ -44,7 +44,7 @@ def main(*arguments: str) -> None:
     )
     run = train(config, note=print, on_step=lambda step, metrics: print(f"step {step}: loss {metrics['loss']:.4f}"))
 
-    result = evaluate(run, clips=64, probes=False)  # probes: is the use of the actions measured, too?
+    result = evaluate(run, clips=64, probes=False)  # probes=True also measures action ranking
     print("Error / persistence by horizon, with its 95 % interval over held-out episodes; below 1 is better:")
     for model, ratios in result.error_over_persistence.items():
         print(f"  {model:8}", *ratios, sep="  ")
@@ -57,5 +57,5 @@ def main(*arguments: str) -> None:
 if __name__ == "__main__":
     try:
         main(*sys.argv[1:])
-    except (UserError, StoppedError) as error:  # stopped: by Ctrl-C, with a checkpoint
+    except (UserError, StoppedError) as error:  # StoppedError: Ctrl-C; a checkpoint was saved
         sys.exit(f"error: {error}")

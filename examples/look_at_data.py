@@ -1,8 +1,8 @@
-"""Look at a data set: what is in it, what a clip holds, and a contact sheet to look at.
+"""Inspect a data set: print its size and the contents of clips, and draw a contact sheet.
 
     python examples/look_at_data.py [DATA]
 
-Without DATA, a folder of DROID's RLDS form, a few episodes of the simulated arm are recorded first.
+DATA is a folder in DROID's RLDS format. Without it, a few episodes of the simulated arm are recorded first.
 """
 
 import sys
@@ -17,7 +17,7 @@ RECORDED, SHEET = Path("demo/examples/data"), Path("demo/examples/contact_sheet.
 
 
 def main(data: str | None = None) -> None:
-    """Print what is in a data set, and draw it."""
+    """Print the size of a data set and the contents of four clips, and draw a contact sheet."""
     if data is None and not RECORDED.exists():
         print("Recording 12 episodes of the simulated arm ...")
         record_dataset(RECORDED, RecordingSpec("B", steps=33, seed=4), episodes=12)
@@ -25,7 +25,7 @@ def main(data: str | None = None) -> None:
     print(f"{len(dataset.table)} episodes, {len(dataset.windows('train'))} training clips")
 
     batch = next(read_clips(dataset, "train", clips=4))
-    if batch.frames is not None:  # as in a latent cache
+    if batch.frames is not None:  # a latent cache has no frames
         print(f"frames   {tuple(batch.frames.shape)}: clips, time, height, width, RGB")
     print(f"states   {tuple(batch.states.shape)}: x, y, z (m), roll, pitch, yaw (rad), gripper (0 open, 1 closed)")
     print(f"actions  {tuple(batch.actions.shape)}: the change from each state to the next")
@@ -36,8 +36,8 @@ def main(data: str | None = None) -> None:
     inspection = inspect_dataset(dataset)
     SHEET.parent.mkdir(parents=True, exist_ok=True)
     x, y, z, *_ = inspection.ranges
-    print(f"The hand was at x {x[0]:.2f} to {x[1]:.2f}, y {y[0]:.2f} to {y[1]:.2f}, z {z[0]:.2f} to {z[1]:.2f} m.")
-    print(f"Look at {plot_dataset(inspection, SHEET, rows=4)}")
+    print(f"Hand positions: x {x[0]:.2f} to {x[1]:.2f}, y {y[0]:.2f} to {y[1]:.2f}, z {z[0]:.2f} to {z[1]:.2f} m.")
+    print(f"Contact sheet: {plot_dataset(inspection, SHEET, rows=4)}")
 
 
 if __name__ == "__main__":

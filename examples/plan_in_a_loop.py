@@ -2,7 +2,7 @@
 
     python examples/plan_in_a_loop.py [RUN_OR_MODEL]
 
-A real robot takes the place of `arm`: an image of its camera, its measured state, a pose to move to.
+For a real robot, replace `arm`: the loop needs a camera image, the measured state, and a command that moves to a pose.
 """
 
 import sys
@@ -18,13 +18,13 @@ from vjepa2_ac.simulation.rollout import set_scene
 from vjepa2_ac.simulation.tasks import arm_for, make_problem
 from vjepa2_ac.spaces import apply_action
 
-FILM = Path("demo/examples/plan_in_a_loop.png")
+IMAGE_STRIP = Path("demo/examples/plan_in_a_loop.png")
 
 
 def main(subject: str = "builtin:sim-tiny", *, samples: int = 100, steps: int = 8) -> None:
-    """Print the distance to the goal after each step, and draw the way."""
+    """Print the distance to the goal after each step, and write all camera images as one image strip."""
     planning = PlanningConfig(samples=samples, iterations=4)
-    if Path(subject, "config.yaml").exists():  # a run; else a model
+    if Path(subject, "config.yaml").exists():  # a run, not a model
         controller = Controller.of_run(load_run(subject), planning)
     else:
         controller = Controller(load_model(subject), planning)
@@ -48,9 +48,9 @@ def main(subject: str = "builtin:sim-tiny", *, samples: int = 100, steps: int = 
         frames.append(arm.image())
         moved = " ".join(f"{100 * number:+.1f}" for number in action[:3])
         print(f"step {step}: {100 * problem.distance_m(arm.state):.1f} cm from the goal, moved by {moved} cm")
-    FILM.parent.mkdir(parents=True, exist_ok=True)
-    FILM.write_bytes(encode_png(np.concatenate([*frames, goal], axis=1)))
-    print(f"Look at {FILM}: the way from left to right; the last image is the goal.")
+    IMAGE_STRIP.parent.mkdir(parents=True, exist_ok=True)
+    IMAGE_STRIP.write_bytes(encode_png(np.concatenate([*frames, goal], axis=1)))
+    print(f"Images: {IMAGE_STRIP}, one per step from left to right; the last image is the goal.")
 
 
 if __name__ == "__main__":

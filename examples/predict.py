@@ -39,12 +39,12 @@ def main(data: str | None = None, model: str = "builtin:sim-tiny") -> None:
         predictions = (teacher_forced, encoded.latents[:, :-1], rollout, first.expand_as(true))
         rows.append(torch.stack([error(predicted, true) for predicted in predictions]))
 
-    print("L1 error       one step  copy before  |  rollout  copy first  ratio")
-    for step, (step_error, copied_before, rollout_error, copied_first) in enumerate(
+    print("L1 error       one step  copy last    |  rollout  copy first  ratio")
+    for step, (step_error, copy_last_error, rollout_error, copy_first_error) in enumerate(
         torch.stack(rows).mean(dim=0).T.tolist(), start=1
     ):
-        print(f"{step * seconds:.2f} s ahead   {step_error:.4f}   {copied_before:.4f}       |  ", end="")
-        print(f"{rollout_error:.4f}   {copied_first:.4f}      {rollout_error / copied_first:.3f}")
+        print(f"{step * seconds:.2f} s ahead   {step_error:.4f}   {copy_last_error:.4f}       |  ", end="")
+        print(f"{rollout_error:.4f}   {copy_first_error:.4f}      {rollout_error / copy_first_error:.3f}")
     print("A ratio below 1 is better than copying the first frame.")
 
 

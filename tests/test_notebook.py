@@ -75,6 +75,6 @@ def test_notebook_runs_and_shows_its_figures(tmp_path: Path) -> None:
         "of persistence",
         "Validation at step 4",
         "sensitive to actions",
-        "cm apart; not moving at all would be",
+        "cm apart; the zero action would be",
     ):
         assert words in printed, words

@@ -1,4 +1,4 @@
-"""The script for Google Cloud does what it is asked, once, and says what it would do."""
+"""`setup_gcp.sh` checks access, creates a bucket once, and prints its commands in a dry run."""
 
 import os
 import re
@@ -20,7 +20,7 @@ LOGIN = "gcloud auth application-default login"
 
 
 class Machine:
-    """A machine whose gcloud and curl only note how they were called; a created bucket is there afterwards."""
+    """A machine whose gcloud and curl only record their calls; a created bucket exists afterwards."""
 
     def __init__(self, folder: Path) -> None:
         self.programs, self.calls_file, self.bucket = folder / "bin", folder / "calls", folder / "bucket"
@@ -29,7 +29,7 @@ class Machine:
             (self.programs / name).symlink_to(f"/bin/{name}")
 
     def install(self, *names: str, create: str = "", status: int = 0) -> None:
-        """Install programs; `create` is what gcloud says when it cannot create a bucket."""
+        """Install programs; `create` is the error of gcloud if it cannot create a bucket."""
         for name in names:
             program = self.programs / name
             refuse = f'echo "{create}" >&2; exit 1' if create else f'echo us-central1 >"{self.bucket}"'
@@ -56,7 +56,7 @@ def machine(tmp_path: Path) -> Machine:
     return Machine(tmp_path)
 
 
-def test_a_dry_run_prints_every_command_and_runs_none_even_without_gcloud(machine: Machine) -> None:
+def test_dry_run_prints_every_command_and_runs_none_even_without_gcloud(machine: Machine) -> None:
     done = machine.run("--dry-run", "--login", *BUCKET)
     assert done.returncode == 0, done.stderr
     commands = [line[2:].replace("\\", "") for line in done.stdout.splitlines() if line.startswith("+ ")]
@@ -68,33 +68,33 @@ def test_a_dry_run_prints_every_command_and_runs_none_even_without_gcloud(machin
     assert machine.calls == []
 
 
-def test_without_options_only_droid_is_asked_for(machine: Machine) -> None:
+def test_without_options_only_access_to_droid_is_checked(machine: Machine) -> None:
     assert os.access(SCRIPT, os.X_OK)
     machine.install("curl")
     done = machine.run()
     assert done.returncode == 0
-    assert "gcloud is not installed; only --login and --bucket need it. https://cloud" in done.stdout
+    assert "gcloud is not installed; only --login and --bucket need it. To install it, see https://cloud" in done.stdout
     assert "DROID can be read" in done.stdout
     assert [call.split()[0] for call in machine.calls] == ["curl"]
 
 
-def test_a_bucket_is_created_once(machine: Machine) -> None:
+def test_bucket_is_created_once(machine: Machine) -> None:
     machine.install("curl", "gcloud")
     first, second = machine.run(*BUCKET), machine.run(*BUCKET)
     assert (first.returncode, second.returncode) == (0, 0), first.stderr + second.stderr
-    assert "gs://my-checkpoints is created, private, in us-central1." in first.stdout
-    assert "gs://my-checkpoints is there already, in us-central1." in second.stdout
+    assert "gs://my-checkpoints was created, private, in us-central1." in first.stdout
+    assert "gs://my-checkpoints exists already, in us-central1." in second.stdout
     assert [call for call in machine.calls if "buckets" in call] == [LIST, CREATE, LIST]
 
 
 @pytest.mark.parametrize(
     ("answer", "words"),
     [
-        ("HTTPError 409: The requested bucket name is not available.", "belongs to someone else.*another name"),
+        ("HTTPError 409: The requested bucket name is not available.", "exists in another project.*another name"),
         ("HTTPError 403: billing is disabled", "could not be created:\n(?s:.*)HTTPError 403: billing is disabled"),
     ],
 )
-def test_a_bucket_that_cannot_be_created_is_explained(machine: Machine, answer: str, words: str) -> None:
+def test_failed_bucket_creation_is_explained(machine: Machine, answer: str, words: str) -> None:
     machine.install("curl", "gcloud", create=answer)
     done = machine.run(*BUCKET)
     assert done.returncode == 1
@@ -102,14 +102,14 @@ def test_a_bucket_that_cannot_be_created_is_explained(machine: Machine, answer: 
     assert not machine.bucket.exists()
 
 
-def test_what_fails_is_named(machine: Machine) -> None:
+def test_failed_step_is_named(machine: Machine) -> None:
     machine.install("curl", status=22)
     done = machine.run()
-    assert (done.returncode, "DROID cannot be read from here" in done.stderr) == (1, True)
+    assert (done.returncode, "DROID cannot be read from this machine" in done.stderr) == (1, True)
     machine.install("curl")
-    not_there = "gcloud is not installed, and --login"
+    not_installed = "gcloud is not installed, and --login"
     for status, options, words in (
-        (0, ["--login"], not_there), (0, BUCKET, not_there), (1, ["--login"], "the login did not succeed"),
+        (0, ["--login"], not_installed), (0, BUCKET, not_installed), (1, ["--login"], "the login did not succeed"),
         (1, BUCKET, "cannot be listed"),
     ):  # fmt: skip
         if status:
@@ -125,12 +125,12 @@ def test_what_fails_is_named(machine: Machine) -> None:
         (["--bucket"], "--bucket needs a value"),
         (["--bucket", "my-checkpoints"], "belong together"),
         (["--bucket", "gs://my", *BUCKET[2:]], "without gs://"),
-        (["--bucket", "My_Bucket", *BUCKET[2:]], "small letters"),
+        (["--bucket", "My_Bucket", *BUCKET[2:]], "lower-case letters"),
         ([*BUCKET[:2], "--project", "My Project", *BUCKET[4:]], "the project's identifier"),
         ([*BUCKET[:4], "--region", "us central; rm"], "such as us-central1"),
     ],
 )
-def test_wrong_options_are_named_and_nothing_is_done(machine: Machine, options: list[str], words: str) -> None:
+def test_wrong_options_are_named_and_no_command_runs(machine: Machine, options: list[str], words: str) -> None:
     machine.install("curl", "gcloud")
     done = machine.run(*options)
     assert done.returncode == 2

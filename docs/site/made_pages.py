@@ -1,4 +1,4 @@
-"""The pages that are made of the code: commands, config keys, the public names, configs and results."""
+"""Write the pages that are generated from the code: commands, config keys, public names, configs and results."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from site_links import ROOT, on_site
 from vjepa2_ac.cli.program import _make_parser
 from vjepa2_ac.config.loading import config_path, config_schema, packaged_configs
 
-_COLUMNS = "88"  # of a help text
-_REFERENCE = {  # page: what it has; below these, all that the code makes
+_COLUMNS = "88"  # width of help texts
+_REFERENCE = {  # page: its description
     "made/commands": "all commands, a line each, and what each `--help` prints",
     "made/config_keys": "every config key with its range and default",
     "made/configs": "the configs of the package, whole",
@@ -45,7 +45,7 @@ _BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusi
 
 
 def write_pages(folder: Path) -> None:
-    """Write all pages that are made, in place of those that are there; files that stay the same are not touched."""
+    """Write all generated pages, and delete pages of earlier builds. Unchanged files are not written."""
     pages = {
         "commands.md": commands_page(),
         "config_keys.md": keys_page(),
@@ -56,12 +56,12 @@ def write_pages(folder: Path) -> None:
         "reference.md": contents_page("Reference", _REFERENCE),
         "project.md": contents_page("Project", _PROJECT),
         "readme.txt": on_site((ROOT / "README.md").read_text(encoding="utf-8"), "README.md", "index.md"),
-        **{f"{name.lower()}.md": _of_the_root(f"{name}.md") for name in ("CHANGELOG", "CONTRIBUTING", "SECURITY")},
+        **{f"{name.lower()}.md": _root_page(f"{name}.md") for name in ("CHANGELOG", "CONTRIBUTING", "SECURITY")},
     }
     folder.mkdir(exist_ok=True)
-    for old in folder.rglob("*.md"):
-        if str(old.relative_to(folder)) not in pages:
-            old.unlink()  # of an earlier build
+    for path in folder.rglob("*.md"):
+        if str(path.relative_to(folder)) not in pages:
+            path.unlink()
     for name, text in pages.items():
         path = folder / name
         path.parent.mkdir(exist_ok=True)
@@ -70,25 +70,25 @@ def write_pages(folder: Path) -> None:
 
 
 def contents_page(title: str, pages: Mapping[str, str]) -> str:
-    """Return a page that lists others, and has them below it in the menu."""
+    """Return a page that lists other pages, and contains them in its menu."""
     links = [f"- {{doc}}`/{page}`: {about}" for page, about in pages.items()]
     entries = [f"/{page}" for page in pages]
     return "\n".join([f"# {title}", "", *links, "", "```{toctree}", ":hidden:", "", *entries, "```", ""])
 
 
 def commands_page() -> str:
-    """Return a section for each command, with what `--help` prints."""
+    """Return the page of all commands, with the output of `--help` for each command."""
     os.environ["COLUMNS"] = _COLUMNS
-    leaves = {" ".join(words): parser for words, parser in _leaves(_make_parser(), ())}
+    parsers = {" ".join(words): parser for words, parser in _find_commands(_make_parser(), ())}
     lines = ["# Every command", "", "As `vjepa2-ac COMMAND --help` prints them; [TAB completes](../start.md) them.", ""]
-    lines += [f"- [{name}](#{name.replace(' ', '-')}): {_first_sentence(one)}" for name, one in leaves.items()]
-    for name, parser in leaves.items():
+    lines += [f"- [{name}](#{name.replace(' ', '-')}): {_first_sentence(parser)}" for name, parser in parsers.items()]
+    for name, parser in parsers.items():
         lines += ["", f"## {name}", "", "```text", parser.format_help().strip(), "```"]
     return "\n".join([*lines, ""])
 
 
 def keys_page() -> str:
-    """Return a table for each section of a config: key, type and range, default, and what it does."""
+    """Return the page of all config keys: a table for each section with key, type and range, default, description."""
     schema = config_schema()
     kinds = schema["properties"]["data"].get("oneOf", [])
     lines = [
@@ -97,12 +97,12 @@ def keys_page() -> str:
     ]  # fmt: skip
     lines += _section("", schema, schema, depth=2)
     for kind in kinds:
-        lines += _own_sections(_resolved(kind, schema), schema)
+        lines += _own_sections(_resolve(kind, schema), schema)
     return "\n".join(lines)
 
 
 def api_page() -> str:
-    """Return the public names, each described by its docstring."""
+    """Return the page of all public names with their docstrings."""
     lines = ["# Public names", "", "`from vjepa2_ac import …`; [shapes and units](../python.md).", ""]
     for name in vjepa2_ac.__all__:
         kind = "autoclass" if name[0].isupper() else "autofunction"
@@ -112,11 +112,11 @@ def api_page() -> str:
 
 
 def configs_page() -> str:
-    """Return the configs that come with the package, whole."""
+    """Return the page with the complete text of the package's configs."""
     lines = [
         "# Configs of the package",
         "",
-        "`vjepa2-ac config text builtin:NAME > my.yaml` begins one of your own.",
+        "`vjepa2-ac config text builtin:NAME > my.yaml` copies a config, as a start for your own.",
         "",
     ]
     for name, about in packaged_configs().items():
@@ -126,8 +126,8 @@ def configs_page() -> str:
 
 
 def examples_page() -> str:
-    """Return the scripts in `examples/`, whole."""
-    lines = ["# Examples", "", "They run on a fresh clone, without a download, unless they say otherwise.", ""]
+    """Return the page with the complete text of the scripts in `examples/`."""
+    lines = ["# Examples", "", "The scripts run on a fresh clone without a download, unless noted otherwise.", ""]
     for path in sorted((ROOT / "examples").rglob("*.py")):
         name = path.relative_to(ROOT)
         lines += [f"## {name}", "", "```python", path.read_text(encoding="utf-8").strip(), "```", ""]
@@ -135,7 +135,7 @@ def examples_page() -> str:
 
 
 def results_pages() -> Iterator[tuple[str, str]]:
-    """Yield the pages of measured results, and one that lists them."""
+    """Yield the pages of measured results, and the page that lists them."""
     names = []
     for path in (*(ROOT / "benchmarks/results").glob("*.md"), *sorted((ROOT / "evidence/results").glob("*.md"))):
         text = path.read_text(encoding="utf-8")
@@ -150,110 +150,113 @@ def results_pages() -> Iterator[tuple[str, str]]:
     yield "results.md", f"# Results\n\n{text}\n\n```{{toctree}}\n{entries}\n```\n"
 
 
-def _of_the_root(name: str) -> str:
-    """Return a page that is a file of the repository's root."""
+def _root_page(name: str) -> str:
+    """Return the page of a file in the repository's root."""
     return on_site((ROOT / name).read_text(encoding="utf-8"), name, f"made/{name.lower()}")
 
 
-def _leaves(
+def _find_commands(
     parser: argparse.ArgumentParser, words: tuple[str, ...]
 ) -> Iterator[tuple[tuple[str, ...], argparse.ArgumentParser]]:
-    inner = [one for one in parser._actions if isinstance(one, argparse._SubParsersAction)]
-    if not inner:
+    """Yield the words and the parser of each command without sub-commands."""
+    actions = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    if not actions:
         yield words, parser
-    for one in inner:
-        for name, below in one.choices.items():
-            yield from _leaves(below, (*words, name))
+    for action in actions:
+        for name, subparser in action.choices.items():
+            yield from _find_commands(subparser, (*words, name))
 
 
 def _first_sentence(parser: argparse.ArgumentParser) -> str:
-    """Return what a command does, in short: the beginning of its description, as Markdown."""
-    found = re.match(r".*?[^.](?=[.;]\s|[.]?$)", re.sub(r"\s+", " ", parser.description or ""))
-    return re.sub(r"([<>*_\[\]|])", r"\\\1", found[0]) if found else ""
+    """Return the first sentence of a command's description, as Markdown."""
+    match = re.match(r".*?[^.](?=[.;]\s|[.]?$)", re.sub(r"\s+", " ", parser.description or ""))
+    return re.sub(r"([<>*_\[\]|])", r"\\\1", match[0]) if match else ""
 
 
-def _resolved(one: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any]:
-    name = one.get("$ref", "").rpartition("/")[2]
-    return schema["$defs"][name] if name else one
+def _resolve(node: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a node of the schema, or the definition that it refers to."""
+    name = node.get("$ref", "").rpartition("/")[2]
+    return schema["$defs"][name] if name else node
 
 
 def _section(prefix: str, section: Mapping[str, Any], schema: Mapping[str, Any], *, depth: int) -> list[str]:
-    """Return the table of a section, then those of the sections within."""
+    """Return the table of a section, followed by the tables of its sub-sections."""
     rows, inner = [], []
-    for name, one in section.get("properties", {}).items():
-        found = _section_of(one, schema)
-        for part in _components_with_options(one):
+    for name, node in section.get("properties", {}).items():
+        subsection = _section_of(node, schema)
+        for part in _components_with_options(node):
             title = f"{prefix}{name}, options of {part['name']['const']}"
             inner.append((title, part["options"], part["options"].get("description", "")))
-        of_items = _section_of(one.get("items") or {}, schema)  # of a list of sections
-        if of_items is not None:
-            inner.append((f"{prefix}{name}", of_items, f"{_about(one)} A list; each item has these keys."))
-        if found is None:
-            rows.append(f"| `{prefix}{name}` | {_kind(one, schema)} | {_default(one)} | {_about(one)} |")
+        item_section = _section_of(node.get("items") or {}, schema)
+        if item_section is not None:
+            inner.append((f"{prefix}{name}", item_section, f"{_about(node)} A list; each item has these keys."))
+        if subsection is None:
+            rows.append(f"| `{prefix}{name}` | {_kind(node, schema)} | {_default(node)} | {_about(node)} |")
         else:
-            inner.append((f"{prefix}{name}", found, _about(one)))
+            inner.append((f"{prefix}{name}", subsection, _about(node)))
     lines = []
     if rows:
         lines += ["| key | values | default | |", "|---|---|---|---|", *rows, ""]
-    for key, found, about in inner:
+    for key, subsection, about in inner:
         if key == "replay.data":
             lines += [f"{'#' * min(depth, 4)} {key}", "", f"{about} Its keys are those of [data](#data).", ""]
             continue
         keys = f"{key.partition(',')[0]}.options." if ", options of " in key else f"{key}."
-        lines += [f"{'#' * min(depth, 4)} {key}", "", about, "", *_section(keys, found, schema, depth=depth + 1)]
+        lines += [f"{'#' * min(depth, 4)} {key}", "", about, "", *_section(keys, subsection, schema, depth=depth + 1)]
     return lines
 
 
-def _components_with_options(one: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the name and the options of each component with options that a key may hold."""
-    properties = [option.get("properties", {}) for option in one.get("anyOf", [])]
+def _components_with_options(node: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the name and the options of each component with options that is a possible value of a key."""
+    properties = [option.get("properties", {}) for option in node.get("anyOf", [])]
     return [part for part in properties if "const" in part.get("name", {})]
 
 
-def _section_of(one: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Return the section that a key holds, None for a value; of several forms of data the first one."""
-    for option in [one, *one.get("anyOf", []), *one.get("allOf", []), *one.get("oneOf", [])]:
-        found = _resolved(option, schema)
-        if "properties" in found and found["properties"].keys() != {"name", "options"}:  # a component is a value
-            return found
+def _section_of(node: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the section of a key, for several data formats the first section; None if the key has a value."""
+    for option in [node, *node.get("anyOf", []), *node.get("allOf", []), *node.get("oneOf", [])]:
+        section = _resolve(option, schema)
+        if "properties" in section and section["properties"].keys() != {"name", "options"}:  # a component is a value
+            return section
     return None
 
 
 def _own_sections(kind: Mapping[str, Any], schema: Mapping[str, Any]) -> list[str]:
-    """Return the sections that one form of data has and the first has not."""
+    """Return the sections of a data format that the first data format does not have."""
     source = kind["properties"]["source"].get("const") or kind["properties"]["source"].get("default")
-    first = _resolved(schema["properties"]["data"]["oneOf"][0], schema)["properties"]
+    first = _resolve(schema["properties"]["data"]["oneOf"][0], schema)["properties"]
     lines = []
-    for name, one in kind["properties"].items():
-        if name not in first and (found := _section_of(one, schema)):
-            lines += [f"## data.{name} (source: {source})", "", *_section(f"data.{name}.", found, schema, depth=3)]
+    for name, node in kind["properties"].items():
+        if name not in first and (section := _section_of(node, schema)):
+            lines += [f"## data.{name} (source: {source})", "", *_section(f"data.{name}.", section, schema, depth=3)]
     return lines
 
 
-def _kind(one: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
-    one = _resolved(one, schema)
-    if "enum" in one:
-        return ", ".join(f"`{value}`" for value in one["enum"])
-    if "const" in one:
-        return f"`{one['const']}`"
-    if options := one.get("anyOf"):
+def _kind(node: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
+    """Return the possible values of a key as text: type and range, or a list of values."""
+    node = _resolve(node, schema)
+    if "enum" in node:
+        return ", ".join(f"`{value}`" for value in node["enum"])
+    if "const" in node:
+        return f"`{node['const']}`"
+    if options := node.get("anyOf"):
         return " or ".join(dict.fromkeys(_kind(option, schema) for option in options))
-    bounds = "".join(f" {sign} {one[name]:,}" for name, sign in _BOUNDS.items() if name in one)
-    if one.get("type") == "array":
-        parts = one.get("prefixItems") or [one.get("items", {})]
+    bounds = "".join(f" {sign} {node[name]:,}" for name, sign in _BOUNDS.items() if name in node)
+    if node.get("type") == "array":
+        parts = node.get("prefixItems") or [node.get("items", {})]
         return f"list of {', '.join(dict.fromkeys(_kind(part, schema) for part in parts))}"
-    return {"null": "null", "object": "mapping"}.get(one.get("type", ""), one.get("type", "any")) + bounds
+    return {"null": "null", "object": "mapping"}.get(node.get("type", ""), node.get("type", "any")) + bounds
 
 
-def _default(one: Mapping[str, Any]) -> str:
-    if "default" not in one:
+def _default(node: Mapping[str, Any]) -> str:
+    if "default" not in node:
         return ""
-    default = one["default"]
+    default = node["default"]
     if isinstance(default, dict) and default.get("options") == {}:
-        default = default["name"]  # of a component
+        default = default["name"]  # a component without options
     text = json.dumps(default)
     return f"`{text if len(text) < 80 else text[:76] + ' …'}`"
 
 
-def _about(one: Mapping[str, Any]) -> str:
-    return re.sub(r"\s+", " ", one.get("description", "")).replace("|", "\\|")
+def _about(node: Mapping[str, Any]) -> str:
+    return re.sub(r"\s+", " ", node.get("description", "")).replace("|", "\\|")

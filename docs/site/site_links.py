@@ -1,4 +1,4 @@
-"""Links between files of the repository, as links between pages of the site."""
+"""Convert links between files of the repository to links between pages of the site."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ _ROOT_PAGES = {
 
 
 def on_site(text: str, file: str, page: str) -> str:
-    """Return the text of a file with links that lead to the pages of the site.
+    """Return the text of a file with links to the pages of the site.
 
-    A link to a file that has no page becomes its label. A link to a file that does not exist stays, and the build
-    reports it. Badges are removed, because the site loads nothing from the network.
+    A link to a file without a page is replaced by its label. A link to a file that does not exist is kept, so that the
+    build reports it. Badges are removed, because the site loads nothing from the network.
 
     Args:
-        text: Markdown.
-        file: Where it is in the repository, such as docs/data.md.
-        page: Which page it becomes, from the folder `docs`.
+        text: The file in Markdown.
+        file: Path of the file in the repository, such as docs/data.md.
+        page: Path of its page, relative to the folder `docs`.
     """
 
-    def replaced(match: re.Match[str]) -> str:
+    def replace_link(match: re.Match[str]) -> str:
         mark, label, target, anchor = match.groups()
         if "://" in target or target.startswith("mailto:"):
             return match[0]
-        meant = os.path.normpath(Path(file).parent / target)
-        found = _page_of(meant, anchor or "")
-        if found is None:
-            return label if (ROOT / meant).exists() else match[0]
-        place, _, inside = found.partition("#")
-        return f"{mark}[{label}]({os.path.relpath(place, Path(page).parent)}{'#' * bool(inside)}{inside})"
+        linked_file = os.path.normpath(Path(file).parent / target)
+        address = _page_of(linked_file, anchor or "")
+        if address is None:
+            return label if (ROOT / linked_file).exists() else match[0]
+        path, _, fragment = address.partition("#")
+        return f"{mark}[{label}]({os.path.relpath(path, Path(page).parent)}{'#' * bool(fragment)}{fragment})"
 
-    return _LINK.sub(replaced, _BADGE.sub("", text))
+    return _LINK.sub(replace_link, _BADGE.sub("", text))
 
 
 def _page_of(path: str, anchor: str) -> str | None:
-    """Return the page or the image of a file, from the folder `docs`, with the anchor."""
+    """Return the page or the image of a file, relative to the folder `docs`, with the anchor; None without a page."""
     if path.startswith("docs/"):
         return path.removeprefix("docs/") + anchor
     if path in _ROOT_PAGES:

@@ -5,8 +5,9 @@
     for run in FOLDER/*/; do vjepa2-ac evaluate "$run"; done
     vjepa2-ac compare FOLDER/*/
 
-Started again, the study goes on, and a trial that was stopped resumes its run; one process at a time in a FOLDER.
-FIGURE is a column of RUN/metrics.jsonl, read at the checkpoint that the run has selected.
+TRIALS is the total number of trials. Started again, the study continues, and a stopped trial resumes its run. Only one
+process may use a FOLDER at a time. METRIC is a column of RUN/metrics.jsonl; a trial's value is that of the selected
+checkpoint.
 """
 
 import sys
@@ -26,21 +27,21 @@ from vjepa2_ac.runs.checkpoint import parse_step, select_checkpoint
 from vjepa2_ac.runs.folder import METRICS
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 
-FIGURE = "action_ranking_error"  # lower is better; or rollout_over_persistence_last
-SPACE = {  # any key of a config
+METRIC = "action_ranking_error"  # lower is better; another is rollout_over_persistence_last
+SPACE = {  # the search space; any config keys
     "training.learning_rate": FloatDistribution(1e-5, 1e-3, log=True),
     "adapter.rank": CategoricalDistribution([8, 16, 32]),
 }
 
 
-def main(place: str, trials: str, *config: str) -> None:
-    """Do trials until there are so many."""
-    folder = Path(place)
+def main(study_folder: str, trials: str, *config: str) -> None:
+    """Run trials until the study has the given number of trials."""
+    folder = Path(study_folder)
     folder.mkdir(parents=True, exist_ok=True)
     if status := vjepa2_ac(["train", *config, f"run_dir={folder / 'check'}", "--check"]):
         sys.exit(status)
     storage = JournalStorage(JournalFileBackend(str(folder / "study.journal")))
-    study = optuna.create_study(storage=storage, study_name=FIGURE, load_if_exists=True)
+    study = optuna.create_study(storage=storage, study_name=METRIC, load_if_exists=True)
     open_trials = study.get_trials(states=[TrialState.RUNNING])
     while open_trials or len(study.trials) < int(trials):
         trial = open_trials.pop(0) if open_trials else study.ask(SPACE)
@@ -48,16 +49,16 @@ def main(place: str, trials: str, *config: str) -> None:
         overrides = [f"{key}={value}" for key, value in trial.params.items()]
         try:
             train(load_config(config[0], [*config[1:], *overrides, f"run_dir={run}"]), note=print)
-        except InputError as error:  # it is refused, or its loss was not finite; of an outage or a stop it can go on
+        except InputError as error:  # an invalid config or a non-finite loss; after an outage the trial stays open
             print(f"trial {trial.number}: {error}")
             study.tell(trial.number, state=TrialState.FAIL)
         except StoppedError:
             sys.exit(EXIT_STATUS)
         else:
             step = parse_step(select_checkpoint(run).path.name)
-            rows = [row for row in read_metrics_log(run / METRICS) if FIGURE in row and row["step"] <= step]
-            study.tell(trial.number, rows[-1][FIGURE])
-    print(f"{FIGURE} {study.best_value:.4f} in {folder / f'{study.best_trial.number:03}'}: {study.best_params}")
+            rows = [row for row in read_metrics_log(run / METRICS) if METRIC in row and row["step"] <= step]
+            study.tell(trial.number, rows[-1][METRIC])
+    print(f"{METRIC} {study.best_value:.4f} in {folder / f'{study.best_trial.number:03}'}: {study.best_params}")
 
 
 if __name__ == "__main__":

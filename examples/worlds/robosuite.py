@@ -3,8 +3,8 @@
     python3 -m venv worlds/robosuite && worlds/robosuite/bin/pip install robosuite==1.5.2 mujoco==3.9.0
     vjepa2-ac simulate RUN --world "worlds/robosuite/bin/python examples/worlds/robosuite.py Lift"
 
-State and targets: the grip site in the frame of the robot's base: metres, extrinsic xyz Euler angles in radians,
-closedness of the gripper from 0 (open) to 1. Every arm has the Panda's gripper; the door has no latch.
+State and targets: the pose of the grip site in the frame of the robot's base (metres, extrinsic xyz Euler angles in
+radians), and the closedness of the gripper from 0 (open) to 1. All arms have the Panda gripper; the door has no latch.
 """
 
 from serve_environment import serve  # first: it moves this folder behind installed packages
@@ -13,11 +13,11 @@ from serve_environment import serve  # first: it moves this folder behind instal
 import numpy as np
 import robosuite
 from robosuite.controllers import load_composite_controller_config
-from robosuite_experts import expert_of, left_m
+from robosuite_experts import compute_distance_m, make_script
 from robosuite_view import TASKS, read_options, set_view
 from scipy.spatial.transform import Rotation
 
-RATE_HZ, MOST_M, MOST_RAD = 15, 0.05, 0.5  # the controller's largest change in a control step
+RATE_HZ, REACH_M, REACH_RAD = 15, 0.05, 0.5  # control rate; the controller's largest changes per control step
 
 
 class World:
@@ -35,22 +35,24 @@ class World:
     def reset(self, seed):
         self.env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
         self.env.reset()
-        first = self.robot._ref_joint_pos_indexes[0]  # turned back: the hand begins where it does without `mount`
+        first = self.robot._ref_joint_pos_indexes[
+            0
+        ]  # compensates `mount`, so that the hand starts at the same position
         self.data.qpos[first] -= np.deg2rad(self.options.mount)
         self.env.sim.forward()
         self.env.update_state()
-        self.closing, self.script = -1.0, expert_of(self)
+        self.closing, self.script = -1.0, make_script(self)
         return self.state(), self.info()
 
     def step(self, target):
         if target is None:
-            place, facing, closedness = next(self.script)
-            target = [*self.pose_in_base(place, facing), closedness]
+            position, rotation, closedness = next(self.script)
+            target = [*self.pose_in_base(position, rotation), closedness]
         state = self.state()
-        if abs(target[6] - state[6]) > 0.1:  # else as before: a thing that is held stays held
+        if abs(target[6] - state[6]) > 0.1:  # smaller changes are ignored, so that a grasped object is not dropped
             self.closing = np.sign(target[6] - state[6])
         turn = Rotation.from_euler("xyz", target[3:6]) * Rotation.from_euler("xyz", state[3:6]).inv()
-        change = [(np.array(target[:3]) - state[:3]) / MOST_M, turn.as_rotvec() / MOST_RAD, [self.closing]]
+        change = [(np.array(target[:3]) - state[:3]) / REACH_M, turn.as_rotvec() / REACH_RAD, [self.closing]]
         self.env.step(np.clip(np.concatenate(change), -1.0, 1.0))
         return self.state(), 0.0, False, False, self.info() | {"target": target}
 
@@ -58,7 +60,7 @@ class World:
         return self.env.sim.render(camera_name="agentview", width=self.options.size, height=self.options.size)[::-1]
 
     def info(self):
-        return {"success": self.env._check_success(), "distance_m": max(0.0, left_m(self))}
+        return {"success": self.env._check_success(), "distance_m": max(0.0, compute_distance_m(self))}
 
     def state(self):
         fingers = self.data.qpos[self.robot._ref_gripper_joint_pos_indexes["right"]]
@@ -68,13 +70,14 @@ class World:
         site = self.robot.eef_site_id["right"]
         return self.data.site_xpos[site].copy(), Rotation.from_matrix(self.data.site_xmat[site].reshape(3, 3))
 
-    def pose_in_base(self, place, facing):
+    def pose_in_base(self, position, rotation):
         turn = self.mount.inv()
-        return [*turn.apply(place - self.origin), *(turn * facing).as_euler("xyz")]
+        return [*turn.apply(position - self.origin), *(turn * rotation).as_euler("xyz")]
 
 
 if __name__ == "__main__":
     options = read_options(__doc__)
-    words, steps, *_ = TASKS[options.task]
+    instruction, steps, *_ = TASKS[options.task]
     name = f"robosuite {robosuite.__version__}"
-    serve(World(options), world=name, task=options.task, instruction=words, rate_hz=RATE_HZ, steps=steps, expert=True)
+    serve(World(options), world=name, task=options.task, instruction=instruction, rate_hz=RATE_HZ, steps=steps,
+          expert=True)  # fmt: skip

@@ -9,12 +9,12 @@ import os
 import sys
 
 os.environ.setdefault("MUJOCO_GL", "egl")
-sys.path.append(sys.path.pop(0))  # else `import robosuite` would find robosuite.py of this folder
+sys.path.append(sys.path.pop(0))  # otherwise `import robosuite` would import robosuite.py from this folder
 answers = os.fdopen(os.dup(1), "w")
-os.dup2(2, 1)  # what libraries print is no answer
+os.dup2(2, 1)  # output of libraries goes to standard error
 
 
-def say(answer):
+def send(answer):
     print(json.dumps(answer), file=answers, flush=True)
 
 
@@ -22,12 +22,12 @@ def serve(env, **about):
     """Answer requests until the input ends.
 
     Args:
-        env: `reset(seed=)` and `step(target)` return the state as observation, and `success` and `distance_m` in info;
-            `step(None)` lets the scripted expert act for a control step, with its `target` in info; `render()` returns
-            the image.
-        about: world, task, rate_hz, steps, instruction, expert.
+        env: `reset(seed=)` and `step(target)` return the state as observation, and `success` and `distance_m` in info.
+            `step(None)` lets the scripted expert act for a control step, and returns its `target` in info. `render()`
+            returns the image.
+        about: The first message: world, task, rate_hz, steps, instruction, expert.
     """
-    say(about)
+    send(about)
     for line in sys.stdin:
         request = json.loads(line)
         if request["do"] == "reset":
@@ -38,4 +38,4 @@ def serve(env, **about):
         pixels = {"height": len(image), "width": len(image[0]), "rgb": base64.b64encode(image.tobytes()).decode()}
         answer = {"image": pixels, "state": list(map(float, state)), "success": bool(info["success"])}
         answer["distance_m"] = float(info["distance_m"])
-        say(answer | ({"target": list(map(float, info["target"]))} if "target" in info else {}))
+        send(answer | ({"target": list(map(float, info["target"]))} if "target" in info else {}))
