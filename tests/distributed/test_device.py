@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +17,19 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.distributed import select_device
+from vjepa2_ac.model.model_files import find_base
 
 COMMANDS = {
     "train": ["train", "CONFIG"],
     "encode": ["encode", "CONFIG"],
-    "evaluate": ["evaluate", "no such model", "--data", "CONFIG", "--out", "out"],
+    "evaluate": ["evaluate", "model", "--data", "CONFIG", "--out", "out"],
     "calibrate": ["data", "calibrate", "CONFIG"],
     "decoder": ["decoder", "CONFIG"],
     "plan": [
-        "plan", "no such model", "--config", "CONFIG", "--start", "seen.png", "--goal", "seen.png", "--state",
+        "plan", "model", "--config", "CONFIG", "--start", "seen.png", "--goal", "seen.png", "--state",
         "0.4,0,0.3,3.1,0,0.1,0.2",
     ],
-    "simulate": ["simulate", "no such model", "--config", "CONFIG"],
+    "simulate": ["simulate", "model", "--config", "CONFIG"],
 }  # fmt: skip
 UNDER_AUTOCAST = ("train", "encode", "evaluate", "calibrate", "decoder")
 
@@ -47,8 +49,8 @@ def gpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None
 def values(**training: str) -> dict[str, Any]:
     return {
         "run_dir": "run",
-        "data": {"path": "no such data", "stride": 4},
-        "model": {"base": "no such model", "dtype": training.pop("dtype", "bfloat16")},
+        "data": {"path": "data", "stride": 4},
+        "model": {"base": "model", "dtype": training.pop("dtype", "bfloat16")},
         "training": training,
     }
 
@@ -62,8 +64,9 @@ def run_command(command: str, monkeypatch: pytest.MonkeyPatch, folder: Path, **t
         pytest.skip("MuJoCo (extra sim) is not installed")
     monkeypatch.chdir(folder)
     Path("config.yaml").write_text(yaml.safe_dump(values(**training)))
-    for name in ("no such data", "no such model"):  # the commands check that they exist before they check the device
+    for name in ("data", "model"):  # the commands check that both exist before they check the device
         Path(name).mkdir(exist_ok=True)
+    shutil.copy(find_base("builtin:sim-tiny") / "config.json", "model")
     Image.fromarray(np.zeros((16, 16, 3), dtype=np.uint8)).save("seen.png")
     return main([word.replace("CONFIG", "config.yaml") for word in COMMANDS[command]])
 
