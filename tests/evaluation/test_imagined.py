@@ -1,4 +1,4 @@
-"""What a run or a model imagines of a held-out clip: the right clip, by the right models, with the right inputs."""
+"""Decoded rollouts of a held-out clip use the requested clip, models, actions and states."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -27,77 +27,79 @@ Imagine = Callable[..., RolloutComparison]
 
 @pytest.fixture
 def imagine(whole_run: Path, whole_decoder: Path) -> Imagine:  # noqa: F811 - the fixture
-    def of(subject: Path = whole_run, **asked: object) -> RolloutComparison:
-        options = {"decoder": str(whole_decoder), "steps": STEPS, **asked}
+    def of(subject: Path = whole_run, **requested: object) -> RolloutComparison:
+        options = {"decoder": str(whole_decoder), "steps": STEPS, **requested}
         return imagine_clip(str(subject), ImagineOptions(**options))  # type: ignore[arg-type]
 
     return of
 
 
 @pytest.fixture
-def given(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Tensor, ...]]:
-    """What every rollout was given: latents, actions, states."""
-    seen: list[tuple[Tensor, ...]] = []
+def rollout_inputs(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Tensor, ...]]:
+    """Return a list to which the inputs of every rollout are appended: latents, actions, states."""
+    inputs_of_rollouts: list[tuple[Tensor, ...]] = []
     roll = WorldModel.rollout
 
-    def remembering(model: WorldModel, *inputs: Tensor) -> Tensor:
-        seen.append(inputs)
+    def record(model: WorldModel, *inputs: Tensor) -> Tensor:
+        inputs_of_rollouts.append(inputs)
         return roll(model, *inputs)
 
-    monkeypatch.setattr(WorldModel, "rollout", remembering)
-    return seen
+    monkeypatch.setattr(WorldModel, "rollout", record)
+    return inputs_of_rollouts
 
 
 @pytest.fixture
 def true_latents(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
-    """The latents of the clip, once it is encoded."""
-    found: list[Tensor] = []
+    """Return a list to which the latents of every encoded batch are appended."""
+    latents: list[Tensor] = []
     encode = imagined.encode_batch
 
-    def remembering(*values: object, **more: object) -> object:
+    def record(*values: object, **more: object) -> object:
         batch = encode(*values, **more)  # type: ignore[arg-type]
-        found.append(batch.latents)
+        latents.append(batch.latents)
         return batch
 
-    monkeypatch.setattr(imagined, "encode_batch", remembering)
-    return found
+    monkeypatch.setattr(imagined, "encode_batch", record)
+    return latents
 
 
-def named(imagination: RolloutComparison) -> dict[tuple[str, str], DecodedRollout]:
-    return {(one.model, one.name): one for one in imagination.rollouts}
+def rollouts_by_model_and_actions(comparison: RolloutComparison) -> dict[tuple[str, str], DecodedRollout]:
+    return {(one.model, one.name): one for one in comparison.rollouts}
 
 
 def test_all_actions_are_rolled_out_by_base_and_adapter(imagine: Imagine) -> None:
-    found = imagine(actions=("true", "close"))
-    assert list(named(found)) == [(who, what) for what in (AS_RECORDED, "close") for who in ("base", "adapter")]
-    for one in found.rollouts:
+    comparison = imagine(actions=("true", "close"))
+    assert list(rollouts_by_model_and_actions(comparison)) == [
+        (model, actions) for actions in (AS_RECORDED, "close") for model in ("base", "adapter")
+    ]
+    for one in comparison.rollouts:
         assert one.frames.shape == (STEPS, 32, 32, 3)
         assert (one.truth is not None) == (one.name == AS_RECORDED)
-    assert found.seconds_per_step == pytest.approx(2 / 15)
-    base, adapter = found.rollouts[:2]
-    assert (base.frames != adapter.frames).any(), "the adapter of the run does nothing"
+    assert comparison.seconds_per_step == pytest.approx(2 / 15)
+    base, adapter = comparison.rollouts[:2]
+    assert (base.frames != adapter.frames).any(), "the adapter must change the prediction"
 
 
 def test_a_perfect_predictor_shows_decoded_truth_bit_for_bit(
     imagine: Imagine, true_latents: list[Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(WorldModel, "rollout", lambda *_: true_latents[0][:, 1:])
-    found = imagine(actions=("true", "up"))
-    for one in found.rollouts:
-        np.testing.assert_array_equal(one.frames, found.decoded_truth)
-    assert (found.decoded_truth != found.decoded_first).any()
+    comparison = imagine(actions=("true", "up"))
+    for one in comparison.rollouts:
+        np.testing.assert_array_equal(one.frames, comparison.decoded_truth)
+    assert (comparison.decoded_truth != comparison.decoded_first).any()
 
 
 def test_rollouts_use_recorded_states_only_with_recorded_actions(
-    imagine: Imagine, given: list[tuple[Tensor, ...]], true_latents: list[Tensor], make_config: MakeConfig
+    imagine: Imagine, rollout_inputs: list[tuple[Tensor, ...]], true_latents: list[Tensor], make_config: MakeConfig
 ) -> None:
-    found = imagine(actions=("true", "right"))
+    comparison = imagine(actions=("true", "right"))
     dataset = open_dataset(make_config().data)
-    episode = dataset.table.find(found.episode_id)
-    steps = range(found.start, found.start + 2 * STEPS + 1, 2)
+    episode = dataset.table.find(comparison.episode_id)
+    steps = range(comparison.start, comparison.start + 2 * STEPS + 1, 2)
     recorded = dataset.source.read(episode).states[list(steps)]
-    as_recorded, (counterfactual, _) = given[:2], given[2:]
-    for context, *_ in given:
+    as_recorded, (counterfactual, _) = rollout_inputs[:2], rollout_inputs[2:]
+    for context, *_ in rollout_inputs:
         assert torch.equal(context, true_latents[0][:, :1])
     for _, actions, states, *_ in as_recorded:
         np.testing.assert_allclose(states[0].numpy(), recorded[:-1], atol=1e-5)
@@ -107,24 +109,24 @@ def test_rollouts_use_recorded_states_only_with_recorded_actions(
     assert (actions[0, :, 1] < 0).all()
     np.testing.assert_allclose(np.diff(states[0, :, :3].numpy(), axis=0), actions[0, :-1, :3].numpy(), atol=1e-5)
     np.testing.assert_allclose(states[0, :, 3:].numpy(), recorded[:1, 3:].repeat(STEPS, axis=0), atol=1e-5)
-    assert np.abs(states[0, 1:].numpy() - recorded[1:-1]).max() > 0.01, "else the recording would show nothing"
+    assert np.abs(states[0, 1:].numpy() - recorded[1:-1]).max() > 0.01, "recorded and counterfactual states must differ"
 
 
 def test_frames_are_those_of_the_requested_clip(imagine: Imagine, make_config: MakeConfig) -> None:
     dataset = open_dataset(make_config().data)
     name = dataset.table.identity(int(dataset.episodes[2]))
-    found = imagine(actions=("true",), episode=name[3:], start=5)  # a part that no other name has
-    assert (found.episode_id, found.start) == (name, 5)
+    comparison = imagine(actions=("true",), episode=name[3:], start=5)  # a substring of only this name
+    assert (comparison.episode_id, comparison.start) == (name, 5)
     assert imagine(actions=("true",), episode=name).start == 0
-    assert len(found.truth) == len(found.decoded_truth) == STEPS
+    assert len(comparison.truth) == len(comparison.decoded_truth) == STEPS
     later = imagine(actions=("true",), episode=name, start=7)
-    np.testing.assert_array_equal(found.truth[0], later.first)
-    np.testing.assert_array_equal(found.truth[1:], later.truth[:-1])
+    np.testing.assert_array_equal(comparison.truth[0], later.first)
+    np.testing.assert_array_equal(comparison.truth[1:], later.truth[:-1])
 
 
 def test_default_clip_has_the_most_motion_of_the_split(imagine: Imagine, make_config: MakeConfig) -> None:
     split = "validation"
-    found = imagine(actions=("true",), evaluation=EvaluationOptions(split=split))
+    comparison = imagine(actions=("true",), evaluation=EvaluationOptions(split=split))
     dataset = open_dataset(make_config(data__frames=STEPS + 1).data)
 
     def motion(name: str, start: int) -> float:
@@ -137,11 +139,11 @@ def test_default_clip_has_the_most_motion_of_the_split(imagine: Imagine, make_co
     ]
     motions = {window: motion(*window) for window in windows}
     assert len(motions) > 3
-    assert motions[found.episode_id, found.start] == pytest.approx(max(motions.values()))
+    assert motions[comparison.episode_id, comparison.start] == pytest.approx(max(motions.values()))
 
 
 def test_action_files_are_named_after_the_file(
-    imagine: Imagine, given: list[tuple[Tensor, ...]], tmp_path: Path
+    imagine: Imagine, rollout_inputs: list[tuple[Tensor, ...]], tmp_path: Path
 ) -> None:
     rows = np.tile([0, 0, 0.02, 0, 0, 0, 0], (STEPS + 2, 1))
     files = [tmp_path / "up.npy", tmp_path / f"{AS_RECORDED}.npy", tmp_path / "more" / "up.npy"]
@@ -149,10 +151,10 @@ def test_action_files_are_named_after_the_file(
     for file in files:
         np.save(file, rows)
     np.savetxt(tmp_path / "up.csv", 2 * rows, delimiter=",")
-    found = imagine(actions=("up", *map(str, files), str(tmp_path / "up.csv")))
+    comparison = imagine(actions=("up", *map(str, files), str(tmp_path / "up.csv")))
     names = ["up", "up.npy", f"{AS_RECORDED}.npy", str(files[2]), "up.csv"]
-    assert [one.name for one in found.rollouts if one.model == "adapter"] == names
-    for _, actions, states, *_ in given[2:8]:
+    assert [one.name for one in comparison.rollouts if one.model == "adapter"] == names
+    for _, actions, states, *_ in rollout_inputs[2:8]:
         np.testing.assert_allclose(actions[0].numpy(), rows[:STEPS], atol=1e-6)
         np.testing.assert_allclose(states[0, :, 2] - states[0, 0, 2], 0.02 * np.arange(STEPS), atol=1e-5)
 
@@ -161,21 +163,21 @@ def test_model_is_rolled_out_on_the_given_data(
     imagine: Imagine, base_folder: Path, make_config: MakeConfig, tmp_path: Path
 ) -> None:
     options = EvaluationOptions(data=make_config(), out=tmp_path)
-    found = imagine(base_folder, actions=("true", "up"), evaluation=options)
-    assert list(named(found)) == [("model", AS_RECORDED), ("model", "up")]
+    comparison = imagine(base_folder, actions=("true", "up"), evaluation=options)
+    assert list(rollouts_by_model_and_actions(comparison)) == [("model", AS_RECORDED), ("model", "up")]
 
 
 def test_real_data_have_no_simulated_outcome(whole_run: Path, whole_decoder: Path) -> None:  # noqa: F811
-    asked = ImagineOptions(decoder=str(whole_decoder), actions=("up",), steps=2)
-    found = imagine_clip(str(whole_run), asked, simulate=simulated_outcome)
-    assert (found.notes, [one.truth for one in found.rollouts]) == ((), [None, None])
+    requested = ImagineOptions(decoder=str(whole_decoder), actions=("up",), steps=2)
+    comparison = imagine_clip(str(whole_run), requested, simulate=simulated_outcome)
+    assert (comparison.notes, [one.truth for one in comparison.rollouts]) == ((), [None, None])
 
 
 # ---- what is refused -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("asked", "found"),
+    ("requested", "comparison"),
     [
         (
             {"actions": ("sideways",)},
@@ -191,12 +193,14 @@ def test_real_data_have_no_simulated_outcome(whole_run: Path, whole_decoder: Pat
         ({"decoder": "nowhere"}, "--decoder nowhere"),
     ],
 )
-def test_invalid_imagine_options_raise(imagine: Imagine, make_config: MakeConfig, asked: dict, found: str) -> None:
-    if asked.get("episode") == "first":
+def test_invalid_imagine_options_raise(
+    imagine: Imagine, make_config: MakeConfig, requested: dict, comparison: str
+) -> None:
+    if requested.get("episode") == "first":
         dataset = open_dataset(make_config().data)
-        asked = asked | {"episode": dataset.table.identity(int(dataset.episodes[0]))}
-    with pytest.raises(InputError, match=found):
-        imagine(**asked)
+        requested = requested | {"episode": dataset.table.identity(int(dataset.episodes[0]))}
+    with pytest.raises(InputError, match=comparison):
+        imagine(**requested)
 
 
 def test_vector_states_allow_only_recorded_actions(make_config: MakeConfig) -> None:

@@ -1,4 +1,4 @@
-"""Every number is a row, and console, page, metrics.json and comparison show the same rows, also of an added metric."""
+"""Console, page, metrics.json and comparison show the same rows, which include those of third-party metrics."""
 
 from pathlib import Path
 
@@ -17,20 +17,20 @@ from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
 from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 
-WHOLE = evaluation(others=("runs/other",))
+EVALUATION = evaluation(others=("runs/other",))
 
 
 def test_key_and_model_identify_a_row() -> None:
-    rows = make_rows(WHOLE)
+    rows = make_rows(EVALUATION)
     assert len({(row.key, row.model) for row in rows}) == len(rows)
     names = {row.key: (row.group, row.name, row.form, row.better) for row in rows}
     assert all((row.group, row.name, row.form, row.better) == names[row.key] for row in rows)
-    assert len(set(names.values())) == len(names), "a line says what it is"
+    assert len(set(names.values())) == len(names), "lines have different labels"
 
 
 def test_rows_equal_the_estimates() -> None:
-    rows = {(row.key, row.model): row.estimate for row in make_rows(WHOLE)}
-    base, adapter = (WHOLE.models[name] for name in ("base", "adapter"))
+    rows = {(row.key, row.model): row.estimate for row in make_rows(EVALUATION)}
+    base, adapter = (EVALUATION.models[name] for name in ("base", "adapter"))
     assert rows["rollout.l1.over_persistence.3", "adapter"] == over_persistence(adapter.errors, "rollout")[2]
     assert rows["rollout.l1.gain_over_base.3", "adapter"] == gain_over(adapter.errors, base.errors)[2]
     assert ("rollout.l1.gain_over_base.3", "base") not in rows
@@ -49,15 +49,15 @@ def test_rows_equal_the_estimates() -> None:
 
 
 def test_console_page_and_file_show_the_same_rows(tmp_path: Path) -> None:
-    rows = make_rows(WHOLE)
+    rows = make_rows(EVALUATION)
     console = PlainConsole(width=250)
     with console.capture() as capture:
         console.print(*row_tables(rows, "Held-out episodes"))
-    shown, page = capture.get(), page_of(WHOLE)
+    shown, page = capture.get(), page_of(EVALUATION)
     for row in rows:
         assert str(row) in page, row
         assert row.detail or str(row) in shown, row
-    write_metrics(WHOLE, tmp_path / METRICS_FILE)
+    write_metrics(EVALUATION, tmp_path / METRICS_FILE)
     written = read_metrics(tmp_path)
     assert [(row.key, row.model) for row in written.rows] == [(row.key, row.model) for row in rows]
     found = written.of("rollout.l1.over_persistence.3")
@@ -66,10 +66,10 @@ def test_console_page_and_file_show_the_same_rows(tmp_path: Path) -> None:
     assert Estimate(found.value or 0, found.low or 0, found.high or 0) == row.estimate
 
 
-# ---- a metric that joins the list ----
+# ---- a third-party metric ----
 
 LARGER = Metric("agreement", "agreement", "1 / (1 + L1)", lambda *pair: 1 / (1 + L1.of(*pair)), smaller_is_better=False)
-SMALLER = Metric("height", "height", "1 / (1 + L1), taken for an error", LARGER.of)
+SMALLER = Metric("height", "height", "1 / (1 + L1), with the wrong direction", LARGER.of)
 PROBES = ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0)
 
 
@@ -78,15 +78,15 @@ def evaluated(trained: object, base: object, *more: Metric) -> Evaluation:
     return evaluate(evaluated_models, again(clips_batch()), about(), metrics=(L1, L2, *more), probes=PROBES)
 
 
-def test_an_added_metric_appears_in_rows_verdict_and_comparison(tmp_path: Path) -> None:
+def test_a_third_party_metric_appears_in_rows_and_comparison(tmp_path: Path) -> None:
     found = evaluated(Halfway(), Copier(), LARGER)
     rows = {(row.key, row.model): row for row in make_rows(found)}
     ratio, gain = (rows[f"rollout.agreement.{what}.1", "adapter"] for what in ("over_persistence", "gain_over_base"))
     assert ratio.better == gain.better == "higher"
     assert gain.value > 0
-    for name, one in (("with", found), ("without", evaluated(Halfway(), Copier()))):
+    for name, each in (("with", found), ("without", evaluated(Halfway(), Copier()))):
         (tmp_path / name).mkdir()
-        write_metrics(one, tmp_path / name / METRICS_FILE)
+        write_metrics(each, tmp_path / name / METRICS_FILE)
     both = {(row.key, row.model): row for row in compare([tmp_path / "with", tmp_path / "without"]).rows}
     assert both["rollout.agreement.over_persistence.4", "with"].value > 1
     assert ("rollout.agreement.over_persistence.4", "without") not in both
@@ -96,7 +96,7 @@ def test_an_added_metric_appears_in_rows_verdict_and_comparison(tmp_path: Path) 
 
 def test_metric_direction_decides_what_is_better() -> None:
     better, worse = (evaluated(*pair, LARGER) for pair in ((Oracle(), Halfway()), (Copier(), Halfway())))
-    assert not summarize(better, make_rows(better)).prediction.reference, "it agrees with L1"
+    assert not summarize(better, make_rows(better)).prediction.reference, "the metric agrees with L1"
     assert not summarize(worse, make_rows(worse)).prediction.reference
-    mistaken = evaluated(Oracle(), Halfway(), SMALLER)
-    assert "(by height " in summarize(mistaken, make_rows(mistaken)).prediction.reference
+    wrong_direction = evaluated(Oracle(), Halfway(), SMALLER)
+    assert "(by height " in summarize(wrong_direction, make_rows(wrong_direction)).prediction.reference

@@ -17,8 +17,8 @@ from worlds import TIME, Copier, Oracle, clips_batch
 CLIPS = 16
 
 
-class Turned(Oracle):
-    """Knows the world, but in axes of its own: it sees turned, and longer, what the robot does."""
+class RotatedOracle(Oracle):
+    """An oracle whose axes are rotated, and optionally scaled or mirrored, relative to those of the robot."""
 
     def __init__(self, degrees: float, gain: float = 1.0, *, mirrored: bool = False) -> None:
         self.back, self.gain, self.side = AxesRotation(-np.deg2rad(degrees)), gain, -1.0 if mirrored else 1.0
@@ -28,29 +28,29 @@ class Turned(Oracle):
         return super().predict(latents, back, states, extrinsics)
 
 
-def starts(**changes: object) -> list[Transition]:
+def make_transitions(**changes: object) -> list[Transition]:
     batch = clips_batch(CLIPS, **changes)  # type: ignore[arg-type]
     return [make_transition(batch, clip, 1) for clip in range(CLIPS)]
 
 
 def fitted(model: object, **changes: object) -> AxisFit:
-    return infer_axes(model, starts(**changes), at_once=64)  # type: ignore[arg-type]
+    return infer_axes(model, make_transitions(**changes), at_once=64)  # type: ignore[arg-type]
 
 
 @functools.cache
-def fitted_to_turned(degrees: float) -> AxisFit:
-    return fitted(Turned(degrees))
+def fit_to_rotated_oracle(degrees: float) -> AxisFit:
+    return fitted(RotatedOracle(degrees))
 
 
 @pytest.mark.parametrize("degrees", [0.0, -60.0, 179.9])
 def test_angle_of_a_rotated_oracle_is_recovered_within_half_a_degree(degrees: float) -> None:
-    found = fitted_to_turned(degrees)
-    yaw = found.yaw_degrees
+    fit = fit_to_rotated_oracle(degrees)
+    yaw = fit.yaw_degrees
     assert yaw.value == pytest.approx(degrees, abs=0.5)
     assert yaw.low <= yaw.value <= yaw.high < yaw.low + 3
-    assert found.error.value == (1.0 if degrees == 0.0 else pytest.approx(0.0, abs=0.02))
-    assert found.problem is None
-    assert (found.pairs, found.episodes) == (CLIPS, CLIPS // 2)
+    assert fit.error.value == (1.0 if degrees == 0.0 else pytest.approx(0.0, abs=0.02))
+    assert fit.problem is None
+    assert (fit.pairs, fit.episodes) == (CLIPS, CLIPS // 2)
 
 
 def test_axes_of_a_model_that_ignores_actions_are_a_problem() -> None:
@@ -58,41 +58,41 @@ def test_axes_of_a_model_that_ignores_actions_are_a_problem() -> None:
 
 
 def test_insignificant_or_uncertain_angle_is_a_problem() -> None:
-    found = fitted_to_turned(-60.0)
-    unsure = replace(found, error=Estimate(0.98, 0.95, 1.01))
-    assert (unsure.problem or "").startswith("no significant improvement")
-    wide = replace(found, yaw_degrees=Estimate(-60.0, -80.0, -30.0))
-    assert (wide.problem or "").startswith("uncertain: yaw -60 degrees, 95 % interval -80 to -30")
+    fit = fit_to_rotated_oracle(-60.0)
+    insignificant = replace(fit, error=Estimate(0.98, 0.95, 1.01))
+    assert (insignificant.problem or "").startswith("no significant improvement")
+    uncertain = replace(fit, yaw_degrees=Estimate(-60.0, -80.0, -30.0))
+    assert (uncertain.problem or "").startswith("uncertain: yaw -60 degrees, 95 % interval -80 to -30")
 
 
 def test_mirrored_axes_or_a_single_episode_are_a_problem() -> None:
-    assert fitted(Turned(0.0, mirrored=True)).problem is not None
+    assert fitted(RotatedOracle(0.0, mirrored=True)).problem is not None
     batch = clips_batch(2)
-    alone = infer_axes(Oracle(), [make_transition(batch, clip, step) for clip in (0, 1) for step in range(TIME - 1)],
-                       at_once=64)  # fmt: skip
-    assert "found 1" in (alone.problem or "")
+    transitions = [make_transition(batch, clip, step) for clip in (0, 1) for step in range(TIME - 1)]
+    single_episode = infer_axes(Oracle(), transitions, at_once=64)
+    assert "found 1" in (single_episode.problem or "")
 
 
-class Placed(Turned):
-    """Expects the hand at a place, too: elsewhere its predictions are off."""
+class PositionedOracle(RotatedOracle):
+    """A rotated oracle whose error grows with the distance of the flange from one position."""
 
-    def __init__(self, degrees: float, place: Tensor) -> None:
+    def __init__(self, degrees: float, position: Tensor) -> None:
         super().__init__(degrees)
-        self.place = place
+        self.position = position
 
     def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-        off = (states[..., :3] - self.place).norm(dim=-1)[..., None, None]
-        return super().predict(latents, actions, states, extrinsics) + 5 * off
+        distance = (states[..., :3] - self.position).norm(dim=-1)[..., None, None]
+        return super().predict(latents, actions, states, extrinsics) + 5 * distance
 
 
 @pytest.mark.parametrize("about", ["base", "middle"])
 def test_centre_of_the_rotation_is_recovered(about: str) -> None:
-    """A mounting is turned about the base; a camera leaves what it looks at where it is."""
-    there = torch.tensor([0.4, 0.1, 0.3, 0.0, 0.0, 0.0, 0.0])
-    expected = there if about == "middle" else AxesRotation(np.deg2rad(45.0)).rotate_poses(there)
-    begun = [replace(start, state=there) for start in starts()]
-    found = infer_axes(Placed(45.0, expected[:3]), begun, at_once=64)
-    assert found.yaw_degrees.value == pytest.approx(45.0, abs=0.5)
-    assert found.centre_m == pytest.approx((0.4, 0.1) if about == "middle" else (0.0, 0.0))
-    assert ("about its base" in found.words()) == (about == "base")
-    assert found.as_dict()["centre_m"] == list(found.centre_m)
+    """A rotated mounting rotates positions about the base. A rotated camera does not move the point it looks at."""
+    pose = torch.tensor([0.4, 0.1, 0.3, 0.0, 0.0, 0.0, 0.0])
+    expected = pose if about == "middle" else AxesRotation(np.deg2rad(45.0)).rotate_poses(pose)
+    transitions = [replace(transition, state=pose) for transition in make_transitions()]
+    fit = infer_axes(PositionedOracle(45.0, expected[:3]), transitions, at_once=64)
+    assert fit.yaw_degrees.value == pytest.approx(45.0, abs=0.5)
+    assert fit.centre_m == pytest.approx((0.4, 0.1) if about == "middle" else (0.0, 0.0))
+    assert ("about its base" in fit.words()) == (about == "base")
+    assert fit.as_dict()["centre_m"] == list(fit.centre_m)

@@ -1,4 +1,4 @@
-"""Checks of batches: each kind of wrong numbers has its own finding."""
+"""Each fault in the values of a data set gives one finding with the cause."""
 
 import re
 from pathlib import Path
@@ -98,15 +98,15 @@ def test_small_test_split_proposes_a_share_that_suffices(tmp_path: Path) -> None
     values = {"source": "npz", "states": "vector", "validation_share": 0.1, "test_share": 0.15}
     dataset = open_dataset(make_data_config(many, **values))
     tested = [dataset.table.identity(index) for index in np.flatnonzero(dataset.split_mask("test")).tolist()]
-    unlucky = make_data_config(
+    with_small_split = make_data_config(
         many, **values, exclude=tuple(tested[3:])
-    )  # a hash draws 3 of 38 episodes, where the share says 5.7
+    )  # the hashes draw 3 of 38 episodes, although the share is 5.7 episodes
     texts = {}
-    for config in (make_data_config(few, **values), unlucky):
+    for config in (make_data_config(few, **values), with_small_split):
         (texts[config.path],) = (one.text for one in check_data(config, clips=2) if "cannot show whether" in one.text)
     assert texts[str(few)].endswith("Record more episodes")
     proposed = float(re.search(r"data.test_share=([\d.]+)", texts[str(many)])[1])
-    members = open_dataset(unlucky.model_copy(update={"test_share": proposed})).split_mask("test").sum()
+    members = open_dataset(with_small_split.model_copy(update={"test_share": proposed})).split_mask("test").sum()
     assert proposed > 0.15
     assert members >= 5
     assert texts[str(many)].endswith(f"the split then has {members}")

@@ -1,4 +1,4 @@
-"""The values that `data check` prints are pinned on a small set."""
+"""`data check` prints the expected values for a small data set."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Duplicates: an episode under several names is found in every form of data, and reported by every command."""
+"""Duplicated episodes are found in every data format, and reported by `data check` and `data inspect`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -39,40 +39,45 @@ def test_copies_are_found_in_every_data_format_and_from_the_cached_index(source:
     config = config_of(source, WRITERS[source](tmp_path / "set", RECORDINGS), tmp_path)
     for _ in range(2):
         dataset = open_dataset(config)
-        found = find_duplicates(dataset)
-        assert (found.is_known, found.episodes, found.different) == (True, 5, 2)
-        assert len(found.copies) == 3
-        one, other = (dataset.table.find(name) for name, _ in found.example)
+        duplicates = find_duplicates(dataset)
+        assert (duplicates.is_known, duplicates.episodes, duplicates.different) == (True, 5, 2)
+        assert len(duplicates.copies) == 3
+        one, other = (dataset.table.find(name) for name, _ in duplicates.example)
         assert one != other
-        np.testing.assert_array_equal(*(dataset.source.read(place).states for place in (one, other)))  # type: ignore[arg-type]
+        np.testing.assert_array_equal(*(dataset.source.read(index).states for index in (one, other)))  # type: ignore[arg-type]
 
 
 def test_duplicates_of_a_remote_data_set_without_states_are_skipped(gcs: Gcs, tmp_path: Path) -> None:
     gcs.upload(write_lerobot(tmp_path / "set", RECORDINGS), "bucket/set")
     config = config_of("lerobot", "gs://bucket/set", tmp_path)
-    found = find_duplicates(open_dataset(config))
-    assert found == Duplicates(is_known=False)
+    duplicates = find_duplicates(open_dataset(config))
+    assert duplicates == Duplicates(is_known=False)
     assert {one.about: one.level for one in check_data(config, clips=2)}["duplicates"] == "skipped"
-    assert str(found) == "needs the states of the episodes in the index, found none"
+    assert str(duplicates) == "needs the states of the episodes in the index, found none"
 
 
 def test_copies_across_splits_are_counted_with_an_example() -> None:
     pairs = in_memory([1 + number // 2 for number in range(40)])
-    found = find_duplicates(pairs)
+    duplicates = find_duplicates(pairs)
     splits = {name: split for split in ("train", "validation", "test") for name in names_in(pairs, split)}
     across = sum(2 for number in range(0, 40, 2) if splits[f"episode {number}"] != splits[f"episode {number + 1}"])
-    assert (found.episodes, found.different, found.across, len(found.copies)) == (40, 20, across, 20)
-    (one, its_split), (other, others_split) = found.example
-    assert (splits[one], splits[other]) == (its_split, others_split)
-    assert its_split != others_split
+    assert (duplicates.episodes, duplicates.different, duplicates.across, len(duplicates.copies)) == (
+        40,
+        20,
+        across,
+        20,
+    )
+    (one, first_split), (other, second_split) = duplicates.example
+    assert (splits[one], splits[other]) == (first_split, second_split)
+    assert first_split != second_split
     assert int(one.split()[1]) // 2 == int(other.split()[1]) // 2
-    assert f"{across} of them have a copy in another split, such as {one} ({its_split})" in str(found)
-    assert "data.exclude" in str(found)
-    assert "data.split_by" in str(found)
+    assert f"{across} of them have a copy in another split, such as {one} ({first_split})" in str(duplicates)
+    assert "data.exclude" in str(duplicates)
+    assert "data.split_by" in str(duplicates)
 
 
 def names_in(dataset: Dataset, split: str) -> list[str]:
-    return [dataset.table.identity(int(place)) for place in dataset.windows(split).episodes]  # type: ignore[arg-type]
+    return [dataset.table.identity(int(index)) for index in dataset.windows(split).episodes]  # type: ignore[arg-type]
 
 
 def test_different_and_unhashed_episodes_are_no_duplicates() -> None:
@@ -93,8 +98,12 @@ def test_copies_with_noise_or_rounding_are_found_and_similar_episodes_are_not(tm
     states = {f"{number}{how}": one for number in range(3) for how, one in enumerate(near(number))}
     for name, one in (states | {f"still {number}": one for number, one in enumerate(still)}).items():
         np.savez(folder / f"{name}.npz", states=one, frames=frames, fps_hz=15.0)
-    found = find_duplicates(open_dataset(config_of("npz", folder, tmp_path)))
-    assert (found.episodes, found.different, found.copies) == (9, 3, ("01", "02", "11", "12", "21", "22"))
+    duplicates = find_duplicates(open_dataset(config_of("npz", folder, tmp_path)))
+    assert (duplicates.episodes, duplicates.different, duplicates.copies) == (
+        9,
+        3,
+        ("01", "02", "11", "12", "21", "22"),
+    )
 
 
 def test_check_and_inspect_warn_only_if_there_are_copies(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Checks of excerpts: frames and states that do not match are found without a model; matching ones give no alarm."""
+"""Faults of frames and states are found without a model, and give no warning if there are none."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,18 +19,18 @@ from vjepa2_ac.inspection.findings import Finding
 from vjepa2_ac.spaces import POSE, StateSpace, make_vector_states
 
 Pair = tuple[np.ndarray, np.ndarray]
-Spoil = Callable[[list[Pair]], list[Pair]]
+Fault = Callable[[list[Pair]], list[Pair]]
 
 EPISODES = 12
 
 
 def recorded(seed: int = 0, episodes: int = EPISODES, steps: int = STEPS) -> list[Pair]:
-    ways = [spot_states(1000 * seed + number, steps) for number in range(episodes)]
-    return [(states, spot_frames(states)) for states in ways]
+    motions = [spot_states(1000 * seed + number, steps) for number in range(episodes)]
+    return [(states, spot_frames(states)) for states in motions]
 
 
-def each(spoil: Callable[[np.ndarray, np.ndarray], Pair]) -> Spoil:
-    return lambda pairs: [spoil(states, frames) for states, frames in pairs]
+def each(fault: Callable[[np.ndarray, np.ndarray], Pair]) -> Fault:
+    return lambda pairs: [fault(states, frames) for states, frames in pairs]
 
 
 def stale(states: np.ndarray) -> np.ndarray:
@@ -47,8 +47,8 @@ def twice(values: np.ndarray) -> np.ndarray:
     return np.repeat(values, 2, axis=0)[: len(values)]
 
 
-SPOILS: dict[str, Spoil] = {
-    "as it is": each(lambda s, f: (s, f)),
+FAULTS: dict[str, Fault] = {
+    "unchanged": each(lambda s, f: (s, f)),
     "a step late": each(lambda s, f: (s[1:], f[:-1])),
     "late": each(lambda s, f: (s[8:], f[:-8])),
     "early": each(lambda s, f: (s[:-2], f[2:])),
@@ -71,7 +71,7 @@ def found_in(pairs: list[Pair], *, stride: int = 4, space: StateSpace = POSE) ->
     return list(excerpt_findings(excerpts, space, stride, 15.0))
 
 
-def alarms_in(pairs: list[Pair], **about: object) -> list[Finding]:
+def warnings_in(pairs: list[Pair], **about: object) -> list[Finding]:
     findings = found_in(pairs, **about)  # type: ignore[arg-type]
     return [finding for finding in findings if finding.level in {"error", "warning"}]
 
@@ -102,14 +102,14 @@ def test_matching_frames_and_states_have_only_ok_findings(seed: int, space: Stat
     ],
 )
 def test_each_fault_gives_exactly_one_finding_with_its_cause(how: str, level: str, about: str, words: str) -> None:
-    (alarm,) = alarms_in(SPOILS[how](recorded()))
-    assert (alarm.level, alarm.about, words in alarm.text) == (level, about, True), alarm
+    (finding,) = warnings_in(FAULTS[how](recorded()))
+    assert (finding.level, finding.about, words in finding.text) == (level, about, True), finding
 
 
-@pytest.mark.parametrize("how", ["as it is", "foreign", "reversed"])
+@pytest.mark.parametrize("how", ["unchanged", "foreign", "reversed"])
 def test_agreement_of_few_short_or_still_episodes_is_skipped(how: str) -> None:
     for pairs in (recorded(episodes=5), recorded(steps=5), [(s[:1].repeat(STEPS, 0), f) for s, f in recorded()]):
-        findings = found_in(SPOILS[how](pairs))
+        findings = found_in(FAULTS[how](pairs))
         assert [finding.level for finding in findings if finding.about == "agreement"] == ["skipped"]
         assert "needs at least 8 moving episodes of 8 or more steps" in findings[-1].text
     (finding,) = found_in([(s[:1], f[:1]) for s, f in recorded()])
@@ -125,7 +125,7 @@ def config_of(path: Path, tmp_path: Path, **changes: object) -> DataConfig:
 
 
 def test_check_reports_shifted_frames_and_skips_agreement_for_a_latent_cache(tmp_path: Path) -> None:
-    late = config_of(write_spots(tmp_path / "late", SPOILS["late"](recorded())), tmp_path)
+    late = config_of(write_spots(tmp_path / "late", FAULTS["late"](recorded())), tmp_path)
     findings = {finding.about: finding for finding in check_data(late, clips=2)}
     assert (findings["agreement"].level, "8 steps" in findings["agreement"].text) == ("error", True)
     cached = config_of(write_cache(open_dataset(late)), tmp_path, source="latents")

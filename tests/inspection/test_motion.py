@@ -1,4 +1,4 @@
-"""Speeds that no arm reaches, padding, rotation formats and episode ends: faults are named, clean data stay silent."""
+"""Faults of motion, rotation formats and episode ends are reported, and clean data give no warning."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -28,7 +28,7 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 def states_of(number: int, steps: int = STEPS) -> np.ndarray:
-    """Return a hand that points down and moves smoothly; roll and yaw pass pi."""
+    """Return poses of a flange that points down and moves smoothly; roll and yaw pass pi."""
     rng, time_s = np.random.default_rng(number), np.arange(steps)[:, None] / RATE_HZ
     waves = np.sin(rng.uniform(0.5, 2.0, 7) * time_s + rng.uniform(0, 6, 7))
     states = np.array([0.5, 0.0, 0.3, np.pi, 0.1, np.pi, 0.5]) + waves * [0.1, 0.2, 0.1, 0.2, 0.2, 0.6, 0.5]
@@ -37,7 +37,7 @@ def states_of(number: int, steps: int = STEPS) -> np.ndarray:
 
 
 def frames_of(states: np.ndarray) -> np.ndarray:
-    """Return a bright disc where the pose is."""
+    """Return frames with a bright disc at the position of each pose."""
     rows, columns = np.mgrid[:36, :48]
     distance = (rows - 18 + 40 * (states[:, 2] - 0.3)[:, None, None]) ** 2
     distance = distance + (columns - 24 - 40 * states[:, 1, None, None]) ** 2
@@ -85,7 +85,7 @@ def near_the_base(number: int) -> Pair:
     return states, frames
 
 
-def standing_at_the_ends(number: int) -> Pair:
+def with_idle_ends(number: int) -> Pair:
     states, frames = clean(number)
     order = np.clip(np.arange(STEPS), 8, 30)
     return states[order], frames[order]
@@ -111,7 +111,7 @@ def read_warnings(config: DataConfig) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 10.0])
-@pytest.mark.parametrize("make", [clean, near_the_base, standing_at_the_ends])
+@pytest.mark.parametrize("make", [clean, near_the_base, with_idle_ends])
 def test_clean_motion_has_no_warning_at_any_rate(tmp_path: Path, make: Callable[[int], Pair], rate_hz: float) -> None:
     findings = findings_of(config_of(tmp_path / "set", make, rate_hz=rate_hz))
     assert {one.level for one in findings.values()} <= {"ok", "skipped"}
@@ -231,7 +231,7 @@ def test_checks_that_need_poses_or_frames_are_skipped_for_vectors_and_latent_cac
     assert findings["speed"].text == "needs poses (data.states: pose), found vectors"
 
 
-# Rotation formats, read from a data set.
+# ---- rotation formats ----
 
 
 def written_as(folder: Path, numbers_of: Callable[[Rotation], np.ndarray], rotation: str) -> DataConfig:

@@ -1,4 +1,4 @@
-"""An oracle finds the variant in which the data were written, and no variant for good data."""
+"""With an oracle, the variant that repairs a fault is better than the unchanged data; correct data have none."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -29,16 +29,16 @@ from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import actions_from_states, matrices_from_euler
 from worlds import Copier
 
-EPISODES, BEYOND = 8, 8  # episodes; steps before the first and behind the last one, for shifts
+EPISODES, BEYOND = 8, 8  # episodes; states before the first and after the last step, for shifts
 ROTATION = slice(3, 12)
-RIGHT = 7  # of blue
+RIGHT = 7  # blue value of the right part of a frame
 
 Fault = Callable[[np.ndarray], np.ndarray]
 
 
 @cache
 def truth(number: int, steps: int = STEPS) -> np.ndarray:
-    """Return where the spot of an episode really is at each step, and for some steps around."""
+    """Return the true states of an episode at each step, and at some steps before and after."""
     return spot_states(number, steps + 2 * BEYOND)
 
 
@@ -51,7 +51,7 @@ def with_inverted_gripper(states: np.ndarray) -> np.ndarray:
 
 
 class TwoSided(MemorySource):
-    """Its frames hold at the right other steps than at the left, and another blue."""
+    """A source whose frames have other steps and another blue value in the right part than in the left part."""
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
         """Return an episode."""
@@ -66,7 +66,7 @@ class TwoSided(MemorySource):
         return replace(episode, read_frames=frames)
 
 
-class Knowing:
+class StepOracle:
     """An oracle for the time of each frame, and for the effect of an action on position, rotation and gripper."""
 
     def __init__(self, steps: int = STEPS, *, sees_bgr: bool = False, sees_mirrored: bool = False) -> None:
@@ -85,7 +85,7 @@ class Knowing:
         return latents[step % len(latents)]
 
     def encode(self, batch: Batch) -> LatentBatch:
-        """Look up what is to be seen: a frame holds its episode and its step as colours."""
+        """Look up the latents: the colours of a frame are the indices of its episode and its step."""
         assert batch.frames is not None
         self.encoded += 1
         seen = batch.frames[:, :, 0, self._column][..., self._channels].numpy().astype(int)
@@ -94,7 +94,7 @@ class Knowing:
         return LatentBatch(latents, batch.states, batch.actions, None, batch.episode_ids, batch.starts)
 
     def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-        """Return the place that an action leads to."""
+        """Return the pose after each action."""
         del states, extrinsics
         after, by = latents.clone(), actions[:, :, None]
         after[..., :3] += by[..., :3]
@@ -117,9 +117,9 @@ def dataset_of(fault: Fault, *, episodes: int = EPISODES, steps: int = STEPS, **
     return Dataset(config, source, table, kept, BrokenEpisodes(config, episodes))
 
 
-def probed(dataset: Dataset, model: Knowing | Copier | None = None) -> VariantProbe:
-    knowing = model if isinstance(model, Knowing) else Knowing()
-    return probe_variants(model or knowing, knowing.encode, dataset, ClipSample("train", 16))
+def probed(dataset: Dataset, model: StepOracle | Copier | None = None) -> VariantProbe:
+    oracle = model if isinstance(model, StepOracle) else StepOracle()
+    return probe_variants(model or oracle, oracle.encode, dataset, ClipSample("train", 16))
 
 
 FAULTS: dict[str, Fault] = {
@@ -143,21 +143,21 @@ def test_repairing_variant_of_each_fault_is_the_best_variant(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["red and blue exchanged", "frames mirrored"])
 def test_variant_that_changes_frames_as_in_training_is_better(name: str) -> None:
-    knowing = Knowing(sees_bgr=name.startswith("red"), sees_mirrored=name.startswith("frames"))
-    probe = probed(dataset_of(at(0)), knowing)
+    oracle = StepOracle(sees_bgr=name.startswith("red"), sees_mirrored=name.startswith("frames"))
+    probe = probed(dataset_of(at(0)), oracle)
     assert probe.better is not None
     assert probe.better.name == name
 
 
 def test_correct_data_have_no_better_variant_and_only_changed_frames_are_encoded_again() -> None:
-    knowing = Knowing()
-    probe = probed(dataset_of(at(0)), knowing)
+    oracle = StepOracle()
+    probe = probed(dataset_of(at(0)), oracle)
     assert probe.better is None
     assert probe.plain.ratio.value < 0.02
     assert min(one.difference.value for one in probe.results) > 0.1
     assert probe.verdict().endswith("on 16 clips from 8 episodes; no variant is significantly better")
     assert probe.is_decided
-    assert knowing.encoded == 2 * 3  # two batches; again with red and blue exchanged, and mirrored
+    assert oracle.encoded == 2 * 3  # two batches; again with red and blue exchanged, and mirrored
     assert {one.name for one in probe.results} >= {*FAULTS, "red and blue exchanged"}
 
 
@@ -191,16 +191,16 @@ def test_probe_with_a_model_not_better_than_persistence_is_undecided() -> None:
 @pytest.mark.parametrize(("steps", "widest"), [(STEPS, 8), (22, 4), (14, 2), (11, 1), (9, 0)])
 def test_shifts_are_limited_by_the_states_on_both_sides_of_a_clip(steps: int, widest: int) -> None:
     dataset = dataset_of(at(0), steps=steps)
-    knowing = Knowing(steps)
+    oracle = StepOracle(steps)
     asked: list[tuple[int, int]] = []
 
     def encode(batch: Batch) -> LatentBatch:
         asked.extend(
             (dataset.table.find(name) or 0, start) for name, start in zip(batch.episode_ids, batch.starts, strict=True)
         )
-        return knowing.encode(batch)
+        return oracle.encode(batch)
 
-    probe = probe_variants(knowing, encode, dataset, ClipSample("train", 16))
+    probe = probe_variants(oracle, encode, dataset, ClipSample("train", 16))
     results = {one.name for one in probe.results}
     for shift in (1, 2, 4, 8):
         assert (f"frames {shift} step{'s' * (shift > 1)} late" in results) == (shift <= widest)
@@ -223,13 +223,13 @@ def test_variants_depend_on_the_state_and_on_available_frames() -> None:
 
 
 def test_persistence_is_measured_on_the_changed_frames() -> None:
-    """Or what moves less in latents would fit better."""
-    knowing = Knowing()
+    """Otherwise a change that reduces the motion in the latents would seem better."""
+    oracle = StepOracle()
 
     def encode(batch: Batch) -> LatentBatch:
         assert batch.frames is not None
         is_mirrored = bool((batch.frames[:, :, 0, 0, 2] == RIGHT).all())
-        latents = knowing.encode(batch)
+        latents = oracle.encode(batch)
         return replace(latents, latents=latents.latents * 0.01) if is_mirrored else latents
 
     dataset = dataset_of(at(0))

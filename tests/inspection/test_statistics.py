@@ -1,4 +1,4 @@
-"""Statistics of a data set: equal to those computed by hand."""
+"""The statistics of a data set equal values computed by hand."""
 
 from pathlib import Path
 
@@ -18,8 +18,8 @@ def make_data_config(droid: Path, **changes: object) -> DataConfig:
     return DataConfig.model_validate(values | changes)
 
 
-def straight_on(steps: int) -> np.ndarray:
-    """One centimetre and one degree (about z, past pi) a step."""
+def steady_motion(steps: int) -> np.ndarray:
+    """Return poses that move by 1 cm and rotate by 1 degree about z, past pi, in each step."""
     states = np.zeros((steps, 7))
     states[:, 0] = 0.01 * np.arange(steps)
     states[:, 5] = (np.pi - 0.05 + np.deg2rad(np.arange(steps)) + np.pi) % (2 * np.pi) - np.pi
@@ -27,58 +27,56 @@ def straight_on(steps: int) -> np.ndarray:
 
 
 def test_motion_per_step_is_in_centimetres_and_degrees_at_every_stride(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = MemorySource([40], states=lambda _: straight_on(40))
+    source = MemorySource([40], states=lambda _: steady_motion(40))
     monkeypatch.setattr("vjepa2_ac.inspection.statistics.candidate_strides", lambda _: (1, 4, 15, 40))
     dataset = dataset_in_memory(source)
     inspection = inspect_dataset(dataset)
-    *found, too_wide = inspection.values["per_model_step"]
-    for one, stride in zip(found, (1, 4, 15), strict=True):
-        assert (one["stride"], one["seconds"]) == (stride, stride / 15)
+    *measured, too_large = inspection.values["per_model_step"]
+    for statistics, stride in zip(measured, (1, 4, 15), strict=True):
+        assert (statistics["stride"], statistics["seconds"]) == (stride, stride / 15)
         assert len(inspection.steps[stride][MOVED]) == 40 - stride
-        assert one[MOVED] == pytest.approx([stride] * 4)
-        assert one[TURNED] == pytest.approx([stride] * 4)
-    assert too_wide == {"stride": 40, "seconds": 40 / 15, MOVED: [], TURNED: []}
+        assert statistics[MOVED] == pytest.approx([stride] * 4)
+        assert statistics[TURNED] == pytest.approx([stride] * 4)
+    assert too_large == {"stride": 40, "seconds": 40 / 15, MOVED: [], TURNED: []}
 
 
 def test_only_long_enough_idle_runs_count_as_idle() -> None:
-    states = straight_on(30)
-    states[5:10] = states[5]  # steps 6 to 9 are idle: too short a run
+    states = steady_motion(30)
+    states[5:10] = states[5]  # steps 6 to 9 are idle, which is too short
     states[15:25] = states[15]
     assert np.flatnonzero(find_idle_steps(states, DataConfig(path="x"))).tolist() == list(range(16, 25))
 
 
 def test_statistics_of_a_data_set_equal_values_computed_by_hand(droid: Path) -> None:
     dataset = open_dataset(make_data_config(droid))
-    found = inspect_dataset(dataset)
-    values = found.values
+    inspection = inspect_dataset(dataset)
+    values = inspection.values
     assert values["length_percentiles_0_10_50_90_100"] == [12, 12, 14, 16, 17]
     assert values["hours"] == pytest.approx(87 / 15 / 3600)
     assert values["success_share"] == pytest.approx(4 / 6)
-    assert len(found.sample) == 6
-    assert list(found.steps) == [4, 8, 15]
+    assert len(inspection.sample) == 6
+    assert list(inspection.steps) == [4, 8, 15]
     splits = [split_of(info.id, dataset.config) for info in dataset.table]
-    assert {name: one["episodes"] for name, one in values["splits"].items()} == {
+    assert {name: counts["episodes"] for name, counts in values["splits"].items()} == {
         name: splits.count(name) for name in ("train", "validation", "test")
     }
     assert [values["splits"][name]["windows"] for name in ("train", "validation", "test")] == [
         *(len(dataset.windows(split)) for split in ("train", "validation")), 0,
     ]  # fmt: skip
     by_hand = np.concatenate([dataset.source.read(index).states for index in range(6)])
-    assert found.ranges[6].tolist() == pytest.approx([by_hand[:, 6].min(), by_hand[:, 6].max()])
+    assert inspection.ranges[6].tolist() == pytest.approx([by_hand[:, 6].min(), by_hand[:, 6].max()])
 
 
-def hundred(broken: frozenset[int], policy: str, pictureless: frozenset[int] = frozenset()) -> Dataset:
-    return dataset_in_memory(
-        MemorySource([60] * 100, unreadable=broken, pictureless=pictureless), broken_episodes=policy
-    )
+def hundred_episodes(broken: frozenset[int], policy: str) -> Dataset:
+    return dataset_in_memory(MemorySource([60] * 100, unreadable=broken), broken_episodes=policy)
 
 
 def test_unreadable_episode_of_the_sample_is_skipped_or_an_error_by_config(caplog: pytest.LogCaptureFixture) -> None:
-    dataset = hundred(frozenset({7}), "skip")
+    dataset = hundred_episodes(frozenset({7}), "skip")
     assert len(inspect_dataset(dataset).sample) == 99
     assert list(dataset.broken.reasons) == ["episode 7"]
     assert "memory: episode 7: damaged" in caplog.text
     with pytest.raises(InputError, match="4 of 100 episodes are broken"):
-        inspect_dataset(hundred(frozenset({7, 8, 9, 10}), "skip"))
+        inspect_dataset(hundred_episodes(frozenset({7, 8, 9, 10}), "skip"))
     with pytest.raises(InputError, match=r"memory: episode 7: damaged\..*add to data\.exclude: \[\"episode 7\"\]"):
-        inspect_dataset(hundred(frozenset({7}), "error"))
+        inspect_dataset(hundred_episodes(frozenset({7}), "error"))

@@ -1,4 +1,4 @@
-"""The stride of an oracle is found; an uncertain result is reported as uncertain."""
+"""The stride of an oracle is calibration; an uncertain result is reported as uncertain."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,7 +20,7 @@ from vjepa2_ac.intervals import Estimate
 
 
 def tracks(lengths: Sequence[int], noise: float = 0.0, unreadable: frozenset[int] = frozenset()) -> MemorySource:
-    """Return episodes in which x grows by 1 mm a step, plus `noise`."""
+    """Return episodes in which x increases by 1 mm per step; the speed of an episode deviates by `noise`."""
 
     def states(index: int) -> np.ndarray:
         speed = 1 + noise * np.random.default_rng(index).normal()
@@ -39,7 +39,7 @@ def dataset_of(source: MemorySource, **changes: object) -> Dataset:
 
 
 def encode(batch: Batch) -> LatentBatch:
-    """The latent of a frame is where the robot is, in millimetres."""
+    """Return latents that are the x position of the robot in millimetres."""
     return LatentBatch(
         latents=batch.states[:, :, None, :1] * 1000,
         states=batch.states,
@@ -74,58 +74,58 @@ def calibrated(
 
 @pytest.mark.parametrize("learned", [4, 8, 15])
 def test_calibration_recovers_the_stride_of_the_training(learned: int) -> None:
-    found = calibrated(ConstantVelocity(learned), tracks([80] * 20, noise=0.1))
-    assert found.stride == learned
-    assert found.is_certain
-    assert "not significant" not in found.verdict()
+    calibration = calibrated(ConstantVelocity(learned), tracks([80] * 20, noise=0.1))
+    assert calibration.stride == learned
+    assert calibration.is_certain
+    assert "not significant" not in calibration.verdict()
 
 
 def test_ratios_equal_values_computed_by_hand() -> None:
-    found = calibrated(ConstantVelocity(8), tracks([80] * 5), clips=10)
-    assert list(found.results) == [4, 8, 15]
-    assert [one.ratio.value for one in found.results.values()] == [
+    calibration = calibrated(ConstantVelocity(8), tracks([80] * 5), clips=10)
+    assert list(calibration.results) == [4, 8, 15]
+    assert [one.ratio.value for one in calibration.results.values()] == [
         pytest.approx(4 / 4, abs=1e-3), pytest.approx(0.0, abs=1e-3), pytest.approx(7 / 15, abs=1e-3),
     ]  # fmt: skip
-    assert [one["stride"] for one in found.as_dict()["strides"]] == [4, 8, 15]
-    assert found.best.difference is not None
-    assert found.best.difference.value == pytest.approx(-7 / 15, abs=1e-3)
+    assert [one["stride"] for one in calibration.as_dict()["strides"]] == [4, 8, 15]
+    assert calibration.best.difference is not None
+    assert calibration.best.difference.value == pytest.approx(-7 / 15, abs=1e-3)
 
 
 def test_all_strides_are_measured_at_the_same_starts() -> None:
-    seen: dict[int, list[tuple[str, int]]] = {}
+    starts_by_stride: dict[int, list[tuple[str, int]]] = {}
 
-    def noting(batch: Batch) -> LatentBatch:
+    def record(batch: Batch) -> LatentBatch:
         stride = round(float(batch.actions[0, 0, 0]) * 1000)
-        seen.setdefault(stride, []).extend(zip(batch.episode_ids, batch.starts, strict=True))
+        starts_by_stride.setdefault(stride, []).extend(zip(batch.episode_ids, batch.starts, strict=True))
         return encode(batch)
 
     source = tracks([30, 50, 60, 80, 46])
-    calibrate(ConstantVelocity(4), noting, dataset_of(source), ClipSample(batch_size=4, clips=12))
-    assert seen[4] == seen[8] == seen[15]
-    assert len(set(seen[4])) == 12
-    assert "track 0" not in {episode for episode, _ in seen[4]}, "a clip at stride 15 has 46 steps"
+    calibrate(ConstantVelocity(4), record, dataset_of(source), ClipSample(batch_size=4, clips=12))
+    assert starts_by_stride[4] == starts_by_stride[8] == starts_by_stride[15]
+    assert len(set(starts_by_stride[4])) == 12
+    assert "track 0" not in {episode for episode, _ in starts_by_stride[4]}, "a clip at stride 15 has 46 steps"
 
 
 def test_persistence_model_has_no_significant_best_stride() -> None:
-    found = calibrated(ConstantVelocity(0), tracks([80] * 6, noise=0.2))
-    assert [one.ratio.value for one in found.results.values()] == [1.0, 1.0, 1.0]
-    assert not found.is_certain
-    assert "not significant" in found.verdict()
-    assert "The model is not better than persistence at any stride" in found.verdict()
+    calibration = calibrated(ConstantVelocity(0), tracks([80] * 6, noise=0.2))
+    assert [one.ratio.value for one in calibration.results.values()] == [1.0, 1.0, 1.0]
+    assert not calibration.is_certain
+    assert "not significant" in calibration.verdict()
+    assert "The model is not better than persistence at any stride" in calibration.verdict()
 
 
-def test_stride_longer_than_every_episode_is_reported_and_the_others_are_measured() -> None:
-    found = calibrated(ConstantVelocity(4), tracks([30] * 6))
-    assert list(found.results) == [4, 8]
-    assert list(found.impossible) == [15]
-    assert "46 steps for a clip of 4 frames at stride 15" in found.impossible[15]
+def test_stride_longer_than_every_episode_is_reported_and_shorter_strides_are_measured() -> None:
+    calibration = calibrated(ConstantVelocity(4), tracks([30] * 6))
+    assert list(calibration.results) == [4, 8]
+    assert list(calibration.impossible) == [15]
+    assert "46 steps for a clip of 4 frames at stride 15" in calibration.impossible[15]
 
 
 def test_stride_that_fits_one_episode_only_is_impossible() -> None:
-    found = calibrated(ConstantVelocity(4), tracks([30] * 6 + [80] * 1))
-    assert list(found.results) == [4, 8]
-    assert "only 1 episode" in found.impossible[15]
-    assert found.best.episodes >= 5
+    calibration = calibrated(ConstantVelocity(4), tracks([30] * 6 + [80] * 1))
+    assert list(calibration.results) == [4, 8]
+    assert "only 1 episode" in calibration.impossible[15]
+    assert calibration.best.episodes >= 5
 
 
 def test_clips_have_at_most_eight_frames_by_default() -> None:
@@ -140,16 +140,16 @@ def test_unreadable_clips_are_skipped_and_an_error_if_no_clip_is_readable(monkey
     source = tracks([80] * 20)
     dataset = dataset_of(source, broken_episodes="skip")
     source.unreadable = frozenset({int(dataset.windows("validation").episodes[0])})
-    found = calibrate(ConstantVelocity(8), encode, dataset, ClipSample(clips=200, batch_size=1))
-    assert found.best.episodes == len(dataset.windows("validation").episodes) - 1
-    assert len({one.clips for one in found.results.values()}) == 1
+    calibration = calibrate(ConstantVelocity(8), encode, dataset, ClipSample(clips=200, batch_size=1))
+    assert calibration.best.episodes == len(dataset.windows("validation").episodes) - 1
+    assert len({one.clips for one in calibration.results.values()}) == 1
     source.unreadable = frozenset(range(20))
     with pytest.raises(InputError, match="none of the clips can be read; broken episodes: track"):
         calibrate(ConstantVelocity(8), encode, dataset, ClipSample(batch_size=4))
 
 
 def test_best_variant_needs_twice_the_half_width_of_its_interval() -> None:
-    """Both were chosen on these clips: an interval that just leaves 0 out says little."""
+    """The best variant was selected on the same clips, so an interval that barely excludes 0 is no evidence."""
     result = VariantResult("one", Estimate(0.5, 0.4, 0.6), 0.2, 0.4, clips=10, episodes=10)
     narrow, wide = (replace(result, difference=Estimate(-0.1, -0.1 - half, half - 0.1)) for half in (0.03, 0.08))
     assert narrow.is_certainly_better(min_episodes=10)

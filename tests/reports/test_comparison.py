@@ -1,4 +1,4 @@
-"""Runs that were measured on the same clips are compared pair by pair; others are refused."""
+"""Runs on the same clips are compared in pairs of clips; runs on different clips raise."""
 
 import csv
 import json
@@ -33,18 +33,18 @@ def written(
 ) -> Path:
     folder.mkdir()
     evaluated_models = [EvaluatedModel("base", "base", base), EvaluatedModel("adapter", "trained", model)]  # type: ignore[arg-type]
-    found = evaluate(
+    comparison = evaluate(
         evaluated_models, again(clips_batch(clips, seed)), about(seed=ranking_seed, **changes), probes=probes
     )
-    write_metrics(found, folder / METRICS_FILE)
+    write_metrics(comparison, folder / METRICS_FILE)
     return folder
 
 
 def test_runs_with_different_base_models_are_compared_with_persistence(tmp_path: Path) -> None:
     folders = [written(tmp_path / name, Oracle(), base=base) for name, base in (("a", Copier()), ("b", Halfway()))]
-    found = compare(folders)
-    assert any("different base models" in note for note in found.notes)
-    assert "base model" not in str(found).splitlines()[2]
+    comparison = compare(folders)
+    assert any("different base models" in note for note in comparison.notes)
+    assert "base model" not in str(comparison).splitlines()[2]
     same = compare([folders[0], written(tmp_path / "c", Halfway())])
     assert not same.notes
     assert "base model" in str(same).splitlines()[2]
@@ -52,34 +52,36 @@ def test_runs_with_different_base_models_are_compared_with_persistence(tmp_path:
 
 def test_different_action_ranking_settings_give_no_recommendation(tmp_path: Path) -> None:
     more = replace(PROBES, samples=12)
-    found = compare([written(tmp_path / "a", Halfway()), written(tmp_path / "b", Halfway(), probes=more)])
-    assert any("measured with different settings" in note for note in found.notes)
-    assert found.next_command == "No run is recommended: the actions were ranked with different settings."
+    comparison = compare([written(tmp_path / "a", Halfway()), written(tmp_path / "b", Halfway(), probes=more)])
+    assert any("measured with different settings" in note for note in comparison.notes)
+    assert comparison.next_command == "No run is recommended: the actions were ranked with different settings."
     other_seed = compare([tmp_path / "a", written(tmp_path / "c", Halfway(), ranking_seed=1)])
     assert not other_seed.notes
 
 
 def test_gain_over_the_first_run_is_paired_by_clip(tmp_path: Path) -> None:
-    found = compare([written(tmp_path / "half", Halfway()), written(tmp_path / "nothing", Copier())])
-    rows = {(row.key, row.model): row for row in found.rows}
+    comparison = compare([written(tmp_path / "half", Halfway()), written(tmp_path / "nothing", Copier())])
+    rows = {(row.key, row.model): row for row in comparison.rows}
     assert rows["rollout.l1.over_persistence.4", "half"].value == pytest.approx(0.5, rel=1e-4)
     assert ("gain_over_first", "half") not in rows
     gain = rows["gain_over_first", "nothing"]
     assert (gain.low, gain.value, gain.high) == pytest.approx((-1.0, -1.0, -1.0), rel=1e-4)
     assert (gain.better, gain.chance) == ("higher", 0.0)
-    assert {row.model for row in found.rows} == {"half", "nothing"}
-    assert [one.value for one in found.curves["half"]] == pytest.approx([0.5] * 4, rel=1e-4)
-    assert found.notes == ()
-    assert found.title.endswith(" episodes")
-    shown = str(found).splitlines()
+    assert {row.model for row in comparison.rows} == {"half", "nothing"}
+    assert [one.value for one in comparison.curves["half"]] == pytest.approx([0.5] * 4, rel=1e-4)
+    assert comparison.notes == ()
+    assert comparison.title.endswith(" episodes")
+    shown = str(comparison).splitlines()
     assert shown[0].startswith("2 runs on the same 12 clips, ")
     assert shown[-1].startswith("The error of nothing is 100 % higher than that of half (95 % CI 100 to 100 %, n = ")
-    assert plot_comparison(found, tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+    assert plot_comparison(comparison, tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
 
 
-def of_runs(found: Comparison, conclusion: Conclusion = "yes", **runs: tuple[float | None, float, int]) -> Comparison:
+def with_runs(
+    comparison: Comparison, conclusion: Conclusion = "yes", **runs: tuple[float | None, float, int]
+) -> Comparison:
     """Return a comparison of runs with these action-ranking errors, last errors over persistence, and steps."""
-    one, curve = next(iter(found.measured.items()))[1], next(iter(found.curves.values()))
+    one, curve = next(iter(comparison.measured.items()))[1], next(iter(comparison.curves.values()))
     measured, curves = {}, {}
     for name, (rank, error, step) in runs.items():
         ranks = replace(one.summary.ranking, value=rank, conclusion=conclusion)
@@ -91,10 +93,10 @@ def of_runs(found: Comparison, conclusion: Conclusion = "yes", **runs: tuple[flo
         )
         measured[name] = replace(one, summary=replace(one.summary, ranking=ranks), about=about)
         curves[name] = (*curve[:-1], replace(curve[-1], value=error))
-    rows = [row for row in found.rows if row.key == "gain_over_first"]
+    rows = [row for row in comparison.rows if row.key == "gain_over_first"]
     gains = tuple(replace(rows[0], model=name) for name in list(runs)[1:])
     return replace(
-        found, measured=measured, curves=curves, rows=gains, folders={name: Path("my runs", name) for name in runs}
+        comparison, measured=measured, curves=curves, rows=gains, folders={name: Path("my runs", name) for name in runs}
     )
 
 
@@ -108,37 +110,37 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
     ("first", "second", "expected"),
     [
         ((0.40, 0.7, 100), (0.30, 0.9, 200), "export 'my runs/b' b-merged --checkpoint 200"),  # ranking decides
-        ((0.30, 0.9, 100), (0.304, 0.7, 200), "export 'my runs/b' b-merged --checkpoint 200"),  # as good as equal
+        ((0.30, 0.9, 100), (0.304, 0.7, 200), "export 'my runs/b' b-merged --checkpoint 200"),  # within the tolerance
         ((0.30, 0.9, 100), (0.306, 0.7, 200), "export 'my runs/a' a-merged --checkpoint 100"),
         ((0.40, 0.7, 100), (0.30, 0.9, 0), "No run is recommended: b, with the lowest action-ranking error, was not"),
         ((0.40, 0.7, 100), (None, 0.9, 200), "No run is recommended: the action-ranking error of b was not measured."),
     ],
 )
 def test_recommendation_uses_the_rule_of_checkpoint_selection(two: Comparison, first, second, expected: str) -> None:
-    assert expected in of_runs(two, a=first, b=second).next_command
+    assert expected in with_runs(two, a=first, b=second).next_command
 
 
 @pytest.mark.parametrize(
     ("conclusion", "reason"), [("no", "is not better than"), ("inconclusive", "is not known to be better than")]
 )
 def test_run_without_better_action_ranking_is_not_recommended(two: Comparison, conclusion, reason: str) -> None:
-    found = of_runs(two, conclusion, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
-    assert found.next_command.startswith(f"No run is recommended: the action ranking of b {reason} ")
+    comparison = with_runs(two, conclusion, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
+    assert comparison.next_command.startswith(f"No run is recommended: the action ranking of b {reason} ")
 
 
 def test_too_few_episodes_give_no_recommendation_and_no_difference(two: Comparison) -> None:
-    found = of_runs(two, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
+    comparison = with_runs(two, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
     few = "1 held-out episode is too few for a conclusion; at least 5 are needed"
-    summaries = {name: one.summary for name, one in found.measured.items()}
+    summaries = {name: one.summary for name, one in comparison.measured.items()}
     summaries = {
         name: replace(one, prediction=replace(one.prediction, needs=f"{few}. So far: error 1 % lower."))
         for name, one in summaries.items()
     }
-    measured = {name: replace(one, summary=summaries[name]) for name, one in found.measured.items()}
-    rows = tuple(replace(row, low=math.nan, high=math.nan) for row in found.rows)
-    found = replace(found, measured=measured, rows=rows)
-    assert found.next_command == f"No run is recommended: {few}."
-    assert f"Whether the errors differ is not measured: {few}." in " ".join(str(found).split())
+    measured = {name: replace(one, summary=summaries[name]) for name, one in comparison.measured.items()}
+    rows = tuple(replace(row, low=math.nan, high=math.nan) for row in comparison.rows)
+    comparison = replace(comparison, measured=measured, rows=rows)
+    assert comparison.next_command == f"No run is recommended: {few}."
+    assert f"Whether the errors differ is not measured: {few}." in " ".join(str(comparison).split())
 
 
 @pytest.mark.parametrize(
@@ -150,10 +152,10 @@ def test_too_few_episodes_give_no_recommendation_and_no_difference(two: Comparis
     ],
 )
 def test_comparison_sentence_has_gain_interval_and_reference(two: Comparison, gain: tuple, sentence: str) -> None:
-    found = of_runs(two, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
+    comparison = with_runs(two, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
     value, low, high = gain
-    rows = tuple(replace(row, value=value, low=low, high=high) for row in found.rows)
-    assert str(replace(found, rows=rows)).splitlines()[-1].startswith(sentence)
+    rows = tuple(replace(row, value=value, low=low, high=high) for row in comparison.rows)
+    assert str(replace(comparison, rows=rows)).splitlines()[-1].startswith(sentence)
 
 
 @pytest.mark.parametrize(
@@ -201,7 +203,7 @@ def test_damaged_metrics_file_raises_with_its_path(tmp_path: Path, changes: dict
 
 
 def test_comparison_table_has_every_row(tmp_path: Path) -> None:
-    found = compare([written(tmp_path / "half_1", Halfway()), written(tmp_path / "100%", Copier())])
-    with write_csv(found.rows, tmp_path / "comparison.csv").open(newline="") as file:
+    comparison = compare([written(tmp_path / "half_1", Halfway()), written(tmp_path / "100%", Copier())])
+    with write_csv(comparison.rows, tmp_path / "comparison.csv").open(newline="") as file:
         rows = [(row["key"], row["model"], float(row["value"])) for row in csv.DictReader(file)]
-    assert rows == [(row.key, row.model, pytest.approx(row.value, nan_ok=True)) for row in found.rows]
+    assert rows == [(row.key, row.model, pytest.approx(row.value, nan_ok=True)) for row in comparison.rows]

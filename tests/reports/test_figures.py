@@ -1,4 +1,4 @@
-"""Figures are drawn for any names, any number of runs, and every outcome of a decision."""
+"""Plots are drawn for any names, any number of runs, and every outcome of a decision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report page begins with the answer and a film, holds all measurements, for any names, and needs no other file."""
+"""The page begins with the summary and a video, contains all measurements, and needs no other file."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SOLVED = Verdict(
 
 
 class Page(HTMLParser):
-    """A page taken to pieces: its elements in order, and its text."""
+    """The elements of a page in order, and the text of the page."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ Usual = tuple[Evaluation, str, Page]
 
 @pytest.fixture(scope="module")
 def usual(_undrawn: Callable[[pytest.MonkeyPatch], None]) -> Usual:
-    """An evaluation of which everything was measured, its page with figures that have content, and that in pieces."""
+    """Return an evaluation with all measurements, its page with all figures, and the parsed page."""
     one = decoded_strips(evaluation(others=("runs/other",)))
     with pytest.MonkeyPatch.context() as patch:
         _undrawn(patch)
@@ -75,7 +75,7 @@ def usual(_undrawn: Callable[[pytest.MonkeyPatch], None]) -> Usual:
 
 
 def leave_figures_empty(patch: pytest.MonkeyPatch) -> None:
-    """Give a page all of its images without content: text and tables are the same."""
+    """Replace all images by empty images, which does not change text and tables."""
     patch.setattr(write, "figure_to_svg", lambda *_: "data:image/svg+xml;base64,")
     patch.setattr(write, "draw_strip", lambda _: np.zeros((8, 8, 3), np.uint8))
 
@@ -121,23 +121,23 @@ def test_the_video_shows_the_clip_with_the_median_error_and_is_short_and_small()
     one = decoded_strips(evaluation(frames=16), size=256)
     best = replace(one.decoded.strips[0], why="best")
     one = replace(one, decoded=replace(one.decoded, strips=(best, one.decoded.strips[1])))
-    film = make_video(one)
-    assert film.clip.why == "median"
-    assert film.clip is one.decoded.strips[1]
+    video = make_video(one)
+    assert video.clip.why == "median"
+    assert video.clip is one.decoded.strips[1]
     frames, times = [], []
-    for file in images(f'{film.url}"{film.still}"'):
+    for file in images(f'{video.url}"{video.still}"'):
         assert len(file) <= MAX_VIDEO_BYTES
         for frame in ImageSequence.Iterator(Image.open(io.BytesIO(file))):
             frames.append(np.asarray(frame.convert("RGB"), dtype=float))
             times.append(frame.info.get("duration", 0))
     assert sum(times) <= 1000 * MAX_VIDEO_S
-    for place, name in enumerate(("truth", "base", "adapter")):
-        for shown, true in zip(frames, [*film.clip.rows[name], film.clip.rows[name][-1]], strict=True):
-            assert np.abs(shown[:256, place * 264 : place * 264 + 256] - true).mean() < 4
+    for column, name in enumerate(("truth", "base", "adapter")):
+        for shown, true in zip(frames, [*video.clip.rows[name], video.clip.rows[name][-1]], strict=True):
+            assert np.abs(shown[:256, column * 264 : column * 264 + 256] - true).mean() < 4
 
 
 def named(name: str) -> Evaluation:
-    """Return an evaluation in which everything that has a name of somebody's choice has this one."""
+    """Return an evaluation in which every user-defined name is this name."""
     form = name.replace("{", "{{").replace("}", "}}") + "{0}"
     one = decoded_strips(evaluation(id_form=form, others=(name,)))
     return replace(
@@ -225,7 +225,7 @@ def test_images_are_described_tables_have_captions_and_headings_do_not_jump(usua
 
 @cache
 def page() -> str:
-    """Return a page of everything that can be measured."""
+    """Return a page with all measurements."""
     return page_of(decoded_strips(evaluation(others=("a run with a rather long name/and/slashes",))))
 
 
@@ -241,8 +241,8 @@ def test_page_opens_in_a_browser_without_errors_or_requests(tmp_path) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("drawn")
 def test_content_security_policy_blocks_injected_scripts(tmp_path) -> None:
-    smuggled = tmp_path / "smuggled.html"
-    smuggled.write_text(page().replace("<main>", '<main><script>document.title = "run"</script>'), encoding="utf-8")
-    seen = open_page(smuggled, tmp_path)
+    injected = tmp_path / "injected.html"
+    injected.write_text(page().replace("<main>", '<main><script>document.title = "run"</script>'), encoding="utf-8")
+    seen = open_page(injected, tmp_path)
     assert "<title>run</title>" not in seen.dom
     assert any("Content Security Policy" in line for line in seen.console)

@@ -1,4 +1,4 @@
-"""Every number of the summary can be recomputed from metrics.json: here with NumPy, and nothing of this package."""
+"""Every number of the summary can be recomputed from metrics.json with NumPy, without this package."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ T = {5: 2.7764451, 6: 2.5705818}  # by number of episodes n: the quantile 0.975 
 PROBES = ProbeOptions(ranking_clips=10, samples=12, landscape_clips=10, nodes=3, examples=0)
 
 
-class Short(Oracle):
+class TooShort(Oracle):
     """Predicts less motion than there is: a lower error than that of the base model, and a lower spread."""
 
     def predict(self, latents, actions, states, extrinsics=None):  # type: ignore[no-untyped-def]
         return super().predict(latents, actions * 0.6 + 0.002, states, extrinsics)
 
 
-class Long(Oracle):
+class TooLong(Oracle):
     """Predicts more motion than there is."""
 
     def predict(self, latents, actions, states, extrinsics=None):  # type: ignore[no-untyped-def]
@@ -37,8 +37,8 @@ class Long(Oracle):
 
 def measured(folder: Path, *, with_base: bool) -> dict[str, Any]:
     """Return the content of the metrics.json of an evaluation, written into a folder."""
-    evaluated_models = [EvaluatedModel("base", "base", Long())] * with_base + [
-        EvaluatedModel("adapter", "trained", Short())
+    evaluated_models = [EvaluatedModel("base", "base", TooLong())] * with_base + [
+        EvaluatedModel("adapter", "trained", TooShort())
     ]
     path = write_metrics(
         evaluate(evaluated_models, again(clips_batch()), about(), probes=PROBES), folder / METRICS_FILE
@@ -80,19 +80,19 @@ def recomputed(metrics: dict[str, Any]) -> dict[str, tuple[str, str, str]]:
     about, models = metrics["about"], metrics["models"]
     ahead = f"{(about['frames'] - 1) * about['seconds_per_step']:.1f} s ahead"
     last = by_clip["last_horizon"]
-    found = {}
+    texts_by_verdict = {}
 
     def gain(metric: str, other: Sequence[float]) -> tuple[str, str]:
         return with_interval(*estimate(lambda sums: 1 - sums[0] / sums[1], [last[metric][name], other], ids))
 
-    nothing = [clip[-1] for clip in by_clip["persistence"]]
-    share, interval = gain("l1", last["l1"][base] if base else nothing)
+    persistence = [clip[-1] for clip in by_clip["persistence"]]
+    share, interval = gain("l1", last["l1"][base] if base else persistence)
     spread = models[name]["distribution"]["variance"][-1] / models[name]["distribution"]["true_variance"][-1]
     before, reference, reference_error = 1.0, "true latents", "that of persistence"
     if base:
         of_base, reference, reference_error = models[base]["distribution"], "base model", "the base model's"
         before = of_base["variance"][-1] / of_base["true_variance"][-1]
-    found["prediction"] = (
+    texts_by_verdict["prediction"] = (
         f"error {share} % lower than {reference_error}, {ahead}",
         interval,
         f"(part of the gain may be blur: spread {spread:.2f}, {reference} {before:.2f})",
@@ -100,12 +100,12 @@ def recomputed(metrics: dict[str, Any]) -> dict[str, tuple[str, str, str]]:
 
     errors = by_clip["one_step"][name]
     cost = with_interval(*estimate(lambda sums: sums[0] / sums[1] - 1, [errors["shuffled"], errors["true"]], ids))
-    found["sensitivity"] = f"one-step error {cost[0]} % higher with shuffled actions", cost[1], ""
+    texts_by_verdict["sensitivity"] = f"one-step error {cost[0]} % higher with shuffled actions", cost[1], ""
 
     ranking = models[name]["ranking"]
     error, interval = with_interval(*mean(ranking["ranks"], ranking["episode_ids"]))
     of_base = f"base model {percent(float(np.mean(models[base]['ranking']['ranks'])))} %, " if base else ""
-    found["ranking"] = f"action-ranking error {error} %", interval, f"({of_base}chance 50 %)"
+    texts_by_verdict["ranking"] = f"action-ranking error {error} %", interval, f"({of_base}chance 50 %)"
 
     def landscape(model: str) -> tuple[tuple[float, float, float], float, float]:
         maps = models[model]["landscapes"]["maps"]
@@ -124,8 +124,8 @@ def recomputed(metrics: dict[str, Any]) -> dict[str, tuple[str, str, str]]:
         of_base = landscape(base)
         texts = [f"base model {of_base[0][0]:.1f} cm", texts[0], f"{texts[1]}, base model {of_base[2]:.2g}"]
     statement = f"energy minimum {distance:.1f} cm from the true action"
-    found["landscape"] = statement, f"[{low:.1f}, {high:.1f}]", f"({'; '.join(texts)})"
-    return found
+    texts_by_verdict["landscape"] = statement, f"[{low:.1f}, {high:.1f}]", f"({'; '.join(texts)})"
+    return texts_by_verdict
 
 
 @pytest.mark.parametrize("with_base", [True, False])
