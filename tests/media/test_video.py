@@ -1,4 +1,4 @@
-"""Video frames: independent of the other decoded frames; writing of videos."""
+"""Reading video frames, which do not depend on the other requested frames, and writing videos."""
 
 import io
 import sys
@@ -23,7 +23,7 @@ STEPS = 40
 FRAMES = [draw_frame(state, size=(36, 64)) for state in synthetic_states(STEPS)]
 
 
-def every_frame(path: Path) -> np.ndarray:
+def decode_all(path: Path) -> np.ndarray:
     with av.open(str(path)) as file:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)])
 
@@ -31,7 +31,7 @@ def every_frame(path: Path) -> np.ndarray:
 @pytest.mark.parametrize(("gop", "b_frames"), [(1, 0), (2, 0), (12, 3), (250, 3)])
 def test_requested_frames_equal_those_of_a_full_decode(tmp_path: Path, gop: int, b_frames: int) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=gop, b_frames=b_frames)
-    frames, generator = every_frame(path), np.random.default_rng(gop)
+    frames, generator = decode_all(path), np.random.default_rng(gop)
     for _ in range(25):
         steps = generator.integers(0, STEPS, generator.integers(1, 9)).tolist()
         np.testing.assert_array_equal(read_frames(path, steps, where="a"), frames[steps])
@@ -41,7 +41,7 @@ def test_requested_frames_equal_those_of_a_full_decode(tmp_path: Path, gop: int,
 def test_open_gop_is_decoded_from_a_valid_key_frame(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """With x265, some frames that are displayed before a key frame are stored after it."""
     path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=12, codec="libx265")
-    frames = every_frame(path)
+    frames = decode_all(path)
     capfd.readouterr()  # discards the output of the encoder
     for step in range(STEPS):
         np.testing.assert_array_equal(read_frames(path, [step], where="a")[0], frames[step])
@@ -50,7 +50,7 @@ def test_open_gop_is_decoded_from_a_valid_key_frame(tmp_path: Path, capfd: pytes
 
 def test_av1_is_decoded() -> None:
     path = GOLDEN / "av1.mp4"  # a stored file, because SVT-AV1 run by root blocks all other processes (SCHED_FIFO)
-    np.testing.assert_array_equal(read_frames(path, [19, 4, 3], where="a"), every_frame(path)[[19, 4, 3]])
+    np.testing.assert_array_equal(read_frames(path, [19, 4, 3], where="a"), decode_all(path)[[19, 4, 3]])
 
 
 @pytest.mark.parametrize(("codec", "pixels"), [("libx265", "gray12le"), ("ffv1", "gray16le")])
@@ -69,11 +69,11 @@ def test_depth_video_raises(codec: str, pixels: str, tmp_path: Path, capfd: pyte
 @pytest.mark.parametrize(("rate", "b_frames"), [(15, 0), (60, 3)])
 def test_header_rate_does_not_affect_frames(tmp_path: Path, rate: int, b_frames: int) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, rate=rate, b_frames=b_frames)
-    np.testing.assert_array_equal(read_frames(path, [31, 2], where="a"), every_frame(path)[[31, 2]])
+    np.testing.assert_array_equal(read_frames(path, [31, 2], where="a"), decode_all(path)[[31, 2]])
     assert read_header(path, where="a").num_frames == STEPS
 
 
-SHOWN_AT = {  # in 1/15360 s, for steps at 10 Hz
+FRAME_TIMES = {  # presentation times in 1/15360 s, for steps at 10 Hz
     "30 frames a second": [512 * frame for frame in range(STEPS)],
     "50 frames a second": [307 * frame for frame in range(STEPS)],
     "25 frames a second, half of the steps between two frames": [614 * frame for frame in range(STEPS)],
@@ -82,12 +82,12 @@ SHOWN_AT = {  # in 1/15360 s, for steps at 10 Hz
 
 
 @pytest.mark.parametrize(("gop", "b_frames"), [(1, 0), (12, 3)])
-@pytest.mark.parametrize("times", SHOWN_AT.values(), ids=SHOWN_AT)
+@pytest.mark.parametrize("times", FRAME_TIMES.values(), ids=FRAME_TIMES)
 def test_step_gets_the_nearest_frame_independent_of_other_steps(
     times: list[int], gop: int, b_frames: int, tmp_path: Path
 ) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=gop, b_frames=b_frames, times=times)
-    frames, shown = every_frame(path), read_frame_times(path, where="a")
+    frames, shown = decode_all(path), read_frame_times(path, where="a")
     assert np.diff(shown).tolist() == np.diff(times).tolist()
     clock = Clock(0.105, 10.0)
     targets = [round(15360 * (0.105 + step / 10)) for step in range(int(shown[-1] / 1536))]
@@ -145,31 +145,31 @@ MATRICES = {  # a, b, c, d of the header's matrix, and the displayed image
 
 
 def with_matrix(path: Path, *matrix: int) -> Path:
-    """Replace the display matrix in the header of an MP4, in place: a b 0, c d 0, 0 0 1."""
+    """Replace the display matrix in the header of an MP4 by (a b 0, c d 0, 0 0 1), and return the path."""
 
-    def packed(a: int, b: int, c: int, d: int) -> bytes:
-        return b"".join(int(one * 65536).to_bytes(4, "big", signed=True) for one in (a, b, 0, c, d, 0, 0, 0, 16384))
+    def pack(a: int, b: int, c: int, d: int) -> bytes:
+        values = (a, b, 0, c, d, 0, 0, 0, 16384)
+        return b"".join(int(value * 65536).to_bytes(4, "big", signed=True) for value in values)
 
     data = path.read_bytes()
-    start = data.index(b"tkhd")
-    place = data.index(packed(1, 0, 0, 1), start)
-    path.write_bytes(data[:place] + packed(*matrix) + data[place + 36 :])
+    offset = data.index(pack(1, 0, 0, 1), data.index(b"tkhd"))
+    path.write_bytes(data[:offset] + pack(*matrix) + data[offset + 36 :])
     return path
 
 
 @pytest.mark.parametrize("clock", [None, Clock(0.0, 15.0)])
-@pytest.mark.parametrize(("matrix", "displayed"), MATRICES.values(), ids=MATRICES)
-def test_frames_are_displayed_upright(
-    matrix: tuple[int, ...], displayed: Callable[[np.ndarray], np.ndarray], clock: Clock | None, tmp_path: Path
+@pytest.mark.parametrize(("matrix", "to_displayed"), MATRICES.values(), ids=MATRICES)
+def test_display_matrix_is_applied_to_frames(
+    matrix: tuple[int, ...], to_displayed: Callable[[np.ndarray], np.ndarray], clock: Clock | None, tmp_path: Path
 ) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, b_frames=2)
     stored = read_frames(path, [0, 7], where="a", clock=clock)
-    upright = read_frames(with_matrix(path, *matrix), [0, 7], where="a", clock=clock)
-    np.testing.assert_array_equal(upright, [displayed(image) for image in stored])
+    displayed = read_frames(with_matrix(path, *matrix), [0, 7], where="a", clock=clock)
+    np.testing.assert_array_equal(displayed, [to_displayed(image) for image in stored])
 
 
 @pytest.mark.parametrize("matrix", [(0, 0, 0, 0), (1, 1, -1, 1), (1, 0, 0, 0)])
-def test_display_matrix_other_than_quarter_turns_raises(matrix: tuple[int, ...], tmp_path: Path) -> None:
+def test_display_matrix_that_is_not_a_rotation_by_90_degrees_raises(matrix: tuple[int, ...], tmp_path: Path) -> None:
     path = with_matrix(write_mp4(tmp_path / "a.mp4", FRAMES), *matrix)
     with pytest.raises(InputError, match="a: a display matrix that is not a rotation by a multiple of 90 degrees"):
         read_frames(path, [0], where="a")
@@ -177,16 +177,16 @@ def test_display_matrix_other_than_quarter_turns_raises(matrix: tuple[int, ...],
 
 def test_only_necessary_packets_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=12)
-    decoded: list[int] = []
-    keep = video_reader._Video._collect
+    decoded_times: list[int] = []
+    original_collect = video_reader._Video._collect
 
-    def counted(self: video_reader._Video, frames: Sequence[Any], *others: Any) -> None:
-        decoded.extend(frame.pts for frame in frames)
-        keep(self, frames, *others)
+    def collect(self: video_reader._Video, frames: Sequence[Any], *arguments: Any) -> None:
+        decoded_times.extend(frame.pts for frame in frames)
+        original_collect(self, frames, *arguments)
 
-    monkeypatch.setattr(video_reader._Video, "_collect", counted)
+    monkeypatch.setattr(video_reader._Video, "_collect", collect)
     read_frames(path, [14, 38], where="a")
-    assert [time // 1024 for time in decoded] == [12, 13, 14, 36, 37, 38]
+    assert [time // 1024 for time in decoded_times] == [12, 13, 14, 36, 37, 38]
 
 
 def test_libav_does_not_allocate_images_above_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,7 +197,7 @@ def test_libav_does_not_allocate_images_above_the_limit(tmp_path: Path, monkeypa
 
 
 class FailingFile(io.BytesIO):
-    """A file whose reads fail after a while, like those of a network."""
+    """A file whose reads fail after a number of reads, like those of a network."""
 
     def __init__(self, data: bytes, reads: int) -> None:
         super().__init__(data)
@@ -221,12 +221,12 @@ def test_network_failure_is_not_reported_as_a_damaged_video(
     assert capfd.readouterr().err == ""
 
 
-def cut(data: bytes, share: float) -> bytes:
-    return data[: int(len(data) * share)]
+def truncate(data: bytes, fraction: float) -> bytes:
+    return data[: int(len(data) * fraction)]
 
 
-def blanked(data: bytes) -> bytes:
-    """Replace a part in the middle of the file by zeros."""
+def zero_middle(data: bytes) -> bytes:
+    """Replace 3,000 bytes of the encoded frames by zeros."""
     start = data.index(b"mdat") + 4000
     return data[:start] + bytes(3000) + data[start + 3000 :]
 
@@ -236,11 +236,11 @@ def blanked(data: bytes) -> bytes:
     [
         (lambda _: b"", "cannot be read as a video"),
         (lambda _: b"<html>" * 100, "cannot be read as a video"),
-        (lambda data: cut(data, 0.5), "cannot be read as a video"),
-        (lambda data: cut(data, 0.99), "cannot be read as a video"),
+        (lambda data: truncate(data, 0.5), "cannot be read as a video"),
+        (lambda data: truncate(data, 0.99), "cannot be read as a video"),
         (lambda data: data.replace(b"vide", b"soun"), "no video"),
         (lambda data: data.replace(b"avc1", b"zzz1"), "codec"),
-        (blanked, "cannot be read as a video"),
+        (zero_middle, "cannot be read as a video"),
     ],
 )
 def test_damaged_video_raises_and_libav_prints_nothing(
@@ -263,19 +263,19 @@ def test_frame_past_the_end_raises(tmp_path: Path, clock: Clock | None) -> None:
 
 def test_reordered_frames_without_header_information_are_found_by_time(tmp_path: Path) -> None:
     """Frames of a file with key frames only may be displayed in another order than they are stored."""
-    shown = [1, 3, 2, 5, 4, 7, 6, 8]  # presentation time of each stored frame
-    whole = every_frame(write_mp4(tmp_path / "whole.mp4", FRAMES[:8], gop=1))
-    with av.open(str(tmp_path / "whole.mp4")) as source, av.open(str(tmp_path / "moved.mp4"), "w") as target:
+    times = [1, 3, 2, 5, 4, 7, 6, 8]  # presentation time of each stored frame
+    frames = decode_all(write_mp4(tmp_path / "original.mp4", FRAMES[:8], gop=1))
+    with av.open(str(tmp_path / "original.mp4")) as source, av.open(str(tmp_path / "reordered.mp4"), "w") as target:
         stream = target.add_stream_from_template(source.streams.video[0])
-        for number, packet in enumerate(list(source.demux(source.streams.video[0]))[:8]):
-            packet.pts, packet.dts, packet.stream = shown[number] * 1024, number * 1024, stream
+        for index, packet in enumerate(list(source.demux(source.streams.video[0]))[:8]):
+            packet.pts, packet.dts, packet.stream = times[index] * 1024, index * 1024, stream
             target.mux(packet)
-    expected = whole[np.argsort(shown)]
-    np.testing.assert_array_equal(read_frames(tmp_path / "moved.mp4", range(8), where="a"), expected)
+    expected = frames[np.argsort(times)]
+    np.testing.assert_array_equal(read_frames(tmp_path / "reordered.mp4", range(8), where="a"), expected)
 
 
 def test_time_unit_too_coarse_for_the_rate_raises(tmp_path: Path) -> None:
-    """A time scale of 0 is read by libav as whole seconds, so that all frames of a second have the same time."""
+    """Libav reads a time scale of 0 as whole seconds, so all frames of a second have the same time."""
     path = write_mp4(tmp_path / "a.mp4", FRAMES)
     data = bytearray(path.read_bytes())
     scale = data.index(b"mdhd") + 16
@@ -288,37 +288,37 @@ def test_time_unit_too_coarse_for_the_rate_raises(tmp_path: Path) -> None:
         read_frames(path, [0, 5], where="a", clock=Clock(0.0, 15.0))
 
 
-def frames(count: int = 5, height: int = 33, width: int = 48) -> list[np.ndarray]:
+def make_frames(count: int = 5, height: int = 33, width: int = 48) -> list[np.ndarray]:
     shades = np.linspace(40, 220, count).astype(np.uint8)
-    made = [np.full((height, width, 3), shade, dtype=np.uint8) for shade in shades]
-    for frame in made:
+    frames = [np.full((height, width, 3), shade, dtype=np.uint8) for shade in shades]
+    for frame in frames:
         frame[:, : width // 2, 0] = 200
         frame[:, : width // 2, 2] = 30
-    return made
+    return frames
 
 
 def test_written_video_reads_back(tmp_path: Path) -> None:
-    made = frames()
-    path = write_video(tmp_path / "new" / "film.mp4", iter(made), rate_hz=3.75)
-    assert read_header(path, where="film").num_frames == 5
-    shown = read_frames(path, range(5), where="film")
-    assert shown.shape == (5, 32, 48, 3)  # an odd row is dropped
-    for ours, theirs in zip(made, shown, strict=True):
-        np.testing.assert_allclose(theirs.mean(axis=(0, 1)), ours[:32].mean(axis=(0, 1)), atol=6)
+    frames = make_frames()
+    path = write_video(tmp_path / "new" / "a.mp4", iter(frames), rate_hz=3.75)
+    assert read_header(path, where="a").num_frames == 5
+    decoded = read_frames(path, range(5), where="a")
+    assert decoded.shape == (5, 32, 48, 3)  # an odd row is dropped
+    for image, frame in zip(decoded, frames, strict=True):
+        np.testing.assert_allclose(image.mean(axis=(0, 1)), frame[:32].mean(axis=(0, 1)), atol=6)
     with av.open(str(path)) as file:
         assert float(file.duration / av.time_base) == pytest.approx(5 / 3.75, abs=0.05)
         assert file.streams.video[0].codec_context.pix_fmt == "yuv420p"
 
 
 def test_failed_video_write_leaves_no_file(tmp_path: Path) -> None:
-    for made, wrong in (([], "without frames"), ([*frames(1), *frames(1, 20)], "in one video")):
-        with pytest.raises(ValueError, match=wrong):
-            write_video(tmp_path / "film.mp4", made, rate_hz=4.0)
+    for frames, message in (([], "without frames"), ([*make_frames(1), *make_frames(1, 20)], "in one video")):
+        with pytest.raises(ValueError, match=message):
+            write_video(tmp_path / "a.mp4", frames, rate_hz=4.0)
         assert not list(tmp_path.iterdir())
 
 
-def test_imagination_without_pyav_writes_a_gif_and_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    noted: list[str] = []
+def test_rollouts_without_pyav_are_written_as_gif_with_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    notes: list[str] = []
     monkeypatch.setitem(sys.modules, "av", None)
     for name, value in (
         ("draw_strip", FRAMES[0]),
@@ -327,7 +327,7 @@ def test_imagination_without_pyav_writes_a_gif_and_a_note(tmp_path: Path, monkey
     ):
         monkeypatch.setattr(imagine, name, lambda *_, value=value, **__: value)
     monkeypatch.setattr(imagine, "make_strip", lambda _: {})
-    written = imagine.write_rollouts(None, tmp_path, reporter=SimpleNamespace(note=noted.append))  # type: ignore[arg-type]
+    written = imagine.write_rollouts(None, tmp_path, reporter=SimpleNamespace(note=notes.append))  # type: ignore[arg-type]
     assert imagine.VIDEO not in {path.name for path in written}
     assert all(path.is_file() for path in written)
-    assert "pip install" in noted[0]
+    assert "pip install" in notes[0]

@@ -15,8 +15,8 @@ from vjepa2_ac.model.low_rank import _LowRankLinear
 PLAIN = {"r": 3, "lora_alpha": 5, "use_rslora": True}
 
 
-def layer(kind: type[Linear] = LoraLinear, dtype: torch.dtype = torch.float32, **changes: Any) -> Any:
-    """Return a layer of 12 inputs and 8 outputs with an adapter that changes the output."""
+def make_layer(kind: type[Linear] = LoraLinear, dtype: torch.dtype = torch.float32, **changes: Any) -> Any:
+    """Return a layer with 12 inputs, 8 outputs, and an adapter that changes the output."""
     generator = torch.Generator().manual_seed(0)
     config = LoraConfig(target_modules=["0"], **PLAIN | changes)
     config._register_custom_module({nn.Linear: kind})
@@ -32,7 +32,7 @@ def tokens(dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 def output_and_gradients(layer: Linear, inputs: Tensor, *, autocast: bool = False) -> list[Tensor]:
-    """Return the output and the gradients of the tokens and of both matrices, with the same masks for the same seed."""
+    """Return the output and the gradients of the tokens and both matrices; dropout masks are the same in each call."""
     inputs = inputs.clone().requires_grad_()
     torch.manual_seed(2)
     with torch.autocast("cpu", torch.bfloat16) if autocast else contextlib.nullcontext():
@@ -45,8 +45,8 @@ def output_and_gradients(layer: Linear, inputs: Tensor, *, autocast: bool = Fals
 
 
 @pytest.fixture
-def by_peft(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the types of the layers that PEFT has computed."""
+def peft_calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Record the type of each layer that PEFT computes."""
     calls: list[str] = []
     original = Linear.forward
 
@@ -59,11 +59,11 @@ def by_peft(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.mark.parametrize("dropout", [0.0, 0.4])
-def test_float32_outputs_and_gradients_equal_those_of_peft(by_peft: list[str], dropout: float) -> None:
-    expected = output_and_gradients(layer(Linear, lora_dropout=dropout), tokens())
-    assert by_peft == ["Linear"]
-    actual = output_and_gradients(layer(lora_dropout=dropout), tokens())
-    assert by_peft == ["Linear"]
+def test_float32_outputs_and_gradients_equal_those_of_peft(peft_calls: list[str], dropout: float) -> None:
+    expected = output_and_gradients(make_layer(Linear, lora_dropout=dropout), tokens())
+    assert peft_calls == ["Linear"]
+    actual = output_and_gradients(make_layer(lora_dropout=dropout), tokens())
+    assert peft_calls == ["Linear"]
     for value, expected_value in zip(actual, expected, strict=True):
         torch.testing.assert_close(value, expected_value, rtol=1e-5, atol=1e-6)
 
@@ -71,12 +71,12 @@ def test_float32_outputs_and_gradients_equal_those_of_peft(by_peft: list[str], d
 @pytest.mark.parametrize("base", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("input_dtype", [torch.float32, torch.bfloat16])
 def test_bfloat16_error_is_at_most_that_of_peft_with_equal_data_types(
-    by_peft: list[str], base: torch.dtype, input_dtype: torch.dtype
+    peft_calls: list[str], base: torch.dtype, input_dtype: torch.dtype
 ) -> None:
-    exact = output_and_gradients(layer(), tokens())
-    expected = output_and_gradients(layer(Linear, base), tokens(input_dtype), autocast=True)
-    actual = output_and_gradients(layer(LoraLinear, base), tokens(input_dtype), autocast=True)
-    assert by_peft == ["Linear"]
+    exact = output_and_gradients(make_layer(), tokens())
+    expected = output_and_gradients(make_layer(Linear, base), tokens(input_dtype), autocast=True)
+    actual = output_and_gradients(make_layer(LoraLinear, base), tokens(input_dtype), autocast=True)
+    assert peft_calls == ["Linear"]
     for value, peft_value, exact_value in zip(actual, expected, exact, strict=True):
         assert value.dtype == peft_value.dtype
         assert (value - exact_value).norm() < 1.5 * (peft_value - exact_value).norm() + 1e-6
@@ -89,32 +89,33 @@ def test_bfloat16_error_is_at_most_that_of_peft_with_equal_data_types(
         {"lora_bias": True},
         {"disabled": True},
         {"merged": True},
-        {"thawed": True},
-        {"flat": True},
+        {"trained": True},
+        {"one token": True},
         {"dtype": torch.bfloat16},
     ],
     ids=["dora", "bias", "disabled", "merged", "trained layer", "one token", "different data types"],
 )
-def test_layers_other_than_plain_lora_are_computed_by_peft(by_peft: list[str], changes: dict[str, Any]) -> None:
+def test_layers_other_than_plain_lora_are_computed_by_peft(peft_calls: list[str], changes: dict[str, Any]) -> None:
     dtype = changes.get("dtype", torch.float32)
     outputs = []
     for kind in (LoraLinear, Linear):
-        adapted = layer(kind, dtype, **{name: True for name in ("use_dora", "lora_bias") if name in changes})
-        adapted.base_layer.requires_grad_("thawed" in changes)
+        adapted = make_layer(kind, dtype, **{name: True for name in ("use_dora", "lora_bias") if name in changes})
+        adapted.base_layer.requires_grad_("trained" in changes)
         if "disabled" in changes:
             adapted.enable_adapters(enabled=False)
         if "merged" in changes:
             adapted.merge()
-        outputs.append(adapted(tokens(dtype)[0, 0] if "flat" in changes else tokens(dtype)))
+        outputs.append(adapted(tokens(dtype)[0, 0] if "one token" in changes else tokens(dtype)))
     assert torch.equal(*outputs)
-    assert by_peft == ["LoraLinear", "Linear"]
+    assert peft_calls == ["LoraLinear", "Linear"]
 
 
-@pytest.mark.parametrize("masked", [True, False])
-@pytest.mark.parametrize("reached", [True, False])
-def test_gradients_equal_numerical_gradients(masked: bool, reached: bool) -> None:
+@pytest.mark.parametrize("is_masked", [True, False])
+@pytest.mark.parametrize("needs_token_gradient", [True, False])
+def test_gradients_equal_numerical_gradients(is_masked: bool, needs_token_gradient: bool) -> None:
     draw = lambda *shape: torch.randn(*shape, dtype=torch.float64, requires_grad=True)  # noqa: E731
     torch.manual_seed(0)
     weight, bias = draw(4, 6).detach(), draw(4).detach()
-    inputs = (draw(2, 3, 6).requires_grad_(reached), draw(2, 3, 6) if masked else None, weight, bias, draw(2, 6))
+    tokens, masked = draw(2, 3, 6).requires_grad_(needs_token_gradient), draw(2, 3, 6) if is_masked else None
+    inputs = (tokens, masked, weight, bias, draw(2, 6))
     assert torch.autograd.gradcheck(_LowRankLinear.apply, (*inputs, draw(4, 2), None, None, 0.7))

@@ -1,4 +1,4 @@
-"""Compiled blocks: the same results as plain ones, and few compilations, not one per step, layer or length."""
+"""Compiled blocks give the results of uncompiled blocks, and are not compiled again for each step, layer or length."""
 
 from typing import Any
 
@@ -18,25 +18,24 @@ from vjepa2_ac.training.step import prediction_losses
 pytestmark = [pytest.mark.usefixtures("traced"), *tracing]
 
 
-def graphs() -> int:
+def count_graphs() -> int:
     return int(counters["stats"]["unique_graphs"])
 
 
-def adapted(sizes: ModelSizes, **changes: Any) -> WorldModel:
-    """Return a model of two blocks whose adapter does something."""
+def make_adapted_model(sizes: ModelSizes) -> WorldModel:
+    """Return a model of two blocks with an adapter that changes the predictions."""
     model = WorldModel.random(sizes, seed=0)
-    add_adapter(model, AdapterConfig(**{"rank": 4, "alpha": 8.0, "dropout": 0.0} | changes), seed=0)
+    add_adapter(model, AdapterConfig(rank=4, alpha=8.0, dropout=0.0), seed=0)
     move_trained(model)
     return model.train()  # type: ignore[return-value]
 
 
-def clips(inputs: Any, count: int = 2) -> LatentBatch:
-    given = (inputs.latents[:count], inputs.states[:count], inputs.actions[:count, :-1])
-    return LatentBatch(*given, None, ("a",) * count, (0,) * count)
+def make_batch(inputs: Any) -> LatentBatch:
+    return LatentBatch(inputs.latents[:2], inputs.states[:2], inputs.actions[:2, :-1], None, ("a", "a"), (0, 0))
 
 
-def loss_and_gradients(model: WorldModel, batch: LatentBatch, *, compiled: bool, rollout: int = 2) -> list[Tensor]:
-    model.set_compiled("with gradients" if compiled else "never")
+def loss_and_gradients(model: WorldModel, batch: LatentBatch, *, is_compiled: bool, rollout: int = 2) -> list[Tensor]:
+    model.set_compiled("with gradients" if is_compiled else "never")
     model.zero_grad()
     torch.manual_seed(0)
     loss = sum(prediction_losses(model, batch, rollout))
@@ -44,22 +43,22 @@ def loss_and_gradients(model: WorldModel, batch: LatentBatch, *, compiled: bool,
     return [loss.detach(), *(value.grad.clone() for value in model.parameters() if value.grad is not None)]
 
 
-def assert_same(found: list[Tensor], expected: list[Tensor], tolerance: float = 1e-5) -> None:
-    assert len(found) == len(expected) > 1
-    for one, other in zip(found, expected, strict=True):
-        assert (one - other).norm() <= tolerance * other.norm()
+def assert_near(actual: list[Tensor], expected: list[Tensor]) -> None:
+    assert len(actual) == len(expected) > 1
+    for value, expected_value in zip(actual, expected, strict=True):
+        assert (value - expected_value).norm() <= 1e-5 * expected_value.norm()
 
 
-def test_compiled_steps_equal_uncompiled_ones_without_recompilation(sizes: ModelSizes, inputs) -> None:
-    model, batch = adapted(sizes), clips(inputs)
+def test_compiled_steps_equal_uncompiled_steps_without_recompilation(sizes: ModelSizes, inputs) -> None:
+    model, batch = make_adapted_model(sizes), make_batch(inputs)
     names = list(model.state_dict())
-    expected = loss_and_gradients(model, batch, compiled=False)
-    assert_same(loss_and_gradients(model, batch, compiled=True), expected)
-    # Two halves of: a first block, later ones, and one step of the rollout. Not one for each block.
-    assert graphs() == 2 * 3
+    expected = loss_and_gradients(model, batch, is_compiled=False)
+    assert_near(loss_and_gradients(model, batch, is_compiled=True), expected)
+    # Both halves of a block are compiled three times: for the first block, for later blocks, and for a rollout step.
+    assert count_graphs() == 2 * 3
     assert not counters["graph_break"]
     model.set_gradient_checkpointing(True)
-    expected = loss_and_gradients(model, batch, compiled=False, rollout=3)
-    assert_same(loss_and_gradients(model, batch, compiled=True, rollout=3), expected)
-    assert graphs() == 2 * 3
+    expected = loss_and_gradients(model, batch, is_compiled=False, rollout=3)
+    assert_near(loss_and_gradients(model, batch, is_compiled=True, rollout=3), expected)
+    assert count_graphs() == 2 * 3
     assert list(model.state_dict()) == names

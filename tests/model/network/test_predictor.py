@@ -1,4 +1,4 @@
-"""The predictor; and its cache: steps computed one after another equal those computed at once."""
+"""The predictor, and its key-value cache: steps computed one after another equal steps computed in one pass."""
 
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,10 @@ def test_predictions_depend_on_their_own_and_earlier_steps_only(model: WorldMode
         assert not torch.isclose(before[:, 2:], after[:, 2:]).all(dim=(0, 2, 3)).any(), name
 
 
-@pytest.mark.parametrize("by_transformers", [True, False])
-def test_initial_output_weights_shrink_with_depth(by_transformers: bool) -> None:
+@pytest.mark.parametrize("uses_transformers", [True, False])
+def test_initial_output_weights_decrease_with_depth(uses_transformers: bool) -> None:
     predictor = new_predictor(WIDE)
-    if not by_transformers:
+    if not uses_transformers:
         predictor.initialise(torch.Generator().manual_seed(0))
     for layer, block in enumerate(predictor.blocks, start=1):
         for name, weight, std in (
@@ -47,20 +47,19 @@ def test_initial_output_weights_shrink_with_depth(by_transformers: bool) -> None
     assert not any(value.any() for name, value in predictor.named_parameters() if name.endswith("bias"))
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of transformers' own loader
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # raised by transformers' own loader
 def test_transformers_loads_a_saved_predictor(model: WorldModel, tmp_path: Path, inputs) -> None:
     model.save_pretrained(tmp_path / "model")
-    alone = ActionConditionedPredictor.from_pretrained(tmp_path / "model" / "predictor")
+    loaded = ActionConditionedPredictor.from_pretrained(tmp_path / "model" / "predictor")
     expected = model.predictor(inputs.latents, inputs.actions, inputs.states)
-    assert torch.equal(alone(inputs.latents, inputs.actions, inputs.states), expected)
+    assert torch.equal(loaded(inputs.latents, inputs.actions, inputs.states), expected)
 
 
 LORA = AdapterConfig(rank=4, alpha=8.0, dropout=0.0)
-PARTS = [(1, 1, 1, 1), (1, 3)]
 
 
-def adapted(sizes: ModelSizes, *, extrinsics: bool = False) -> WorldModel:
-    """Return a model whose adapter does something."""
+def make_adapted_model(sizes: ModelSizes, *, extrinsics: bool = False) -> WorldModel:
+    """Return a model with an adapter that changes the predictions."""
     predictor = sizes.predictor.model_copy(update={"use_extrinsics": extrinsics})
     model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
     add_adapter(model, LORA, seed=0)
@@ -68,47 +67,48 @@ def adapted(sizes: ModelSizes, *, extrinsics: bool = False) -> WorldModel:
     return model.train()  # type: ignore[return-value]
 
 
-def arguments(inputs: Any, *, extrinsics: bool = False) -> list[Tensor]:
-    """Return latents, actions, states and perhaps extrinsics that ask for gradients."""
-    given = [inputs.latents, inputs.actions, inputs.states]
+def make_arguments(inputs: Any, *, extrinsics: bool = False) -> list[Tensor]:
+    """Return the arguments of `predict`, with gradients."""
+    arguments = [inputs.latents, inputs.actions, inputs.states]
     if extrinsics:
-        given.append(torch.randn(2, 4, 6, generator=torch.Generator().manual_seed(3)))
-    return [value.clone().requires_grad_() for value in given]
+        arguments.append(torch.randn(2, 4, 6, generator=torch.Generator().manual_seed(3)))
+    return [value.clone().requires_grad_() for value in arguments]
 
 
-def in_parts(model: WorldModel, given: list[Tensor], steps: tuple[int, ...]) -> Tensor:
+def predict_with_cache(model: WorldModel, arguments: list[Tensor], steps_per_call: tuple[int, ...]) -> Tensor:
     cache = KeyValueCache()
-    parts = zip(*(value.split(steps, dim=1) for value in given), strict=True)
-    return torch.cat([model.predict(*part, cache=cache) for part in parts], dim=1)
+    calls = zip(*(value.split(steps_per_call, dim=1) for value in arguments), strict=True)
+    return torch.cat([model.predict(*call, cache=cache) for call in calls], dim=1)
 
 
-def output_and_gradients(model: WorldModel, predicted: Tensor, given: list[Tensor]) -> list[Tensor]:
-    towards = torch.randn(predicted.shape, generator=torch.Generator().manual_seed(4))
+def output_and_gradients(model: WorldModel, predicted: Tensor, arguments: list[Tensor]) -> list[Tensor]:
+    weights = torch.randn(predicted.shape, generator=torch.Generator().manual_seed(4))
     trained = [value for value in model.parameters() if value.requires_grad]
-    return [predicted, *torch.autograd.grad((predicted * towards).sum(), [*given, *trained])]
+    return [predicted, *torch.autograd.grad((predicted * weights).sum(), [*arguments, *trained])]
 
 
-def assert_same(found: list[Tensor], expected: list[Tensor], tolerance: float = 1e-5) -> None:
-    """Each tensor differs from its twin by rounding, measured against the whole of it."""
-    for one, other in zip(found, expected, strict=True):
-        assert other.any()
-        assert (one - other).norm() <= tolerance * other.norm()
+def assert_near(actual: list[Tensor], expected: list[Tensor]) -> None:
+    """Check that the norm of each difference is small, relative to the norm of the expected tensor."""
+    for value, expected_value in zip(actual, expected, strict=True):
+        assert expected_value.any()
+        assert (value - expected_value).norm() <= 1e-5 * expected_value.norm()
 
 
-@pytest.mark.parametrize("parts", PARTS)
+@pytest.mark.parametrize("steps_per_call", [(1, 1, 1, 1), (1, 3)])
 @pytest.mark.parametrize(("extrinsics", "checkpointing"), [(False, False), (True, True)])
 def test_cached_steps_give_the_predictions_and_gradients_of_a_single_pass(
-    sizes: ModelSizes, inputs, parts: tuple[int, ...], extrinsics: bool, checkpointing: bool
+    sizes: ModelSizes, inputs, steps_per_call: tuple[int, ...], extrinsics: bool, checkpointing: bool
 ) -> None:
-    model = adapted(sizes, extrinsics=extrinsics)
-    given = arguments(inputs, extrinsics=extrinsics)
-    expected = output_and_gradients(model, model.predict(*given), given)
+    model = make_adapted_model(sizes, extrinsics=extrinsics)
+    arguments = make_arguments(inputs, extrinsics=extrinsics)
+    expected = output_and_gradients(model, model.predict(*arguments), arguments)
     model.set_gradient_checkpointing(checkpointing)
-    assert_same(output_and_gradients(model, in_parts(model, given, parts), given), expected)
+    predicted = predict_with_cache(model, arguments, steps_per_call)
+    assert_near(output_and_gradients(model, predicted, arguments), expected)
 
 
-def plain_rollout(model: WorldModel, context: Tensor, actions: Tensor, states: Tensor) -> Tensor:
-    """Compute everything again for each prediction."""
+def rollout_without_cache(model: WorldModel, context: Tensor, actions: Tensor, states: Tensor) -> Tensor:
+    """Return a rollout in which each prediction is computed from all earlier frames."""
     latents = context
     for time in range(context.shape[1], actions.shape[1] + 1):
         following = model.predict(latents, actions[:, :time], states[:, :time])[:, -1:]
@@ -119,6 +119,7 @@ def plain_rollout(model: WorldModel, context: Tensor, actions: Tensor, states: T
 @pytest.mark.parametrize("context", [1, 3])
 @torch.no_grad()
 def test_rollout_equals_a_rollout_without_a_cache(sizes: ModelSizes, inputs, context: int) -> None:
-    model = adapted(sizes)
-    given = (inputs.latents[:, :context], inputs.actions, inputs.states)
-    torch.testing.assert_close(model.rollout(*given), plain_rollout(model, *given), rtol=1e-5, atol=1e-5)
+    model = make_adapted_model(sizes)
+    arguments = (inputs.latents[:, :context], inputs.actions, inputs.states)
+    expected = rollout_without_cache(model, *arguments)
+    torch.testing.assert_close(model.rollout(*arguments), expected, rtol=1e-5, atol=1e-5)

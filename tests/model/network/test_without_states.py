@@ -1,4 +1,4 @@
-"""A predictor without states: the one with states whose state tokens are cut out."""
+"""A predictor without states equals a predictor with states whose state tokens are removed."""
 
 from pathlib import Path
 
@@ -23,62 +23,64 @@ from vjepa2_ac.model.world_model import (
 
 STEPS, GRID = 4, 3
 LORA = AdapterConfig(rank=2, alpha=4.0)
-both = pytest.mark.parametrize("extrinsics", [False, True])
+with_and_without_extrinsics = pytest.mark.parametrize("extrinsics", [False, True])
 
 
-def pair(*, extrinsics: bool = False) -> tuple[WorldModel, WorldModel]:
-    """Return a model with states and one without, which has all weights of the other that it needs."""
-    full, cut = (tiny_model(extrinsics=extrinsics, states=states) for states in (True, False))
-    shared = {name: full.predictor.state_dict()[name] for name in cut.predictor.state_dict()}
-    cut.predictor.load_state_dict(shared)
-    return full, cut
+def make_models(*, extrinsics: bool = False) -> tuple[WorldModel, WorldModel]:
+    """Return a model with states, and a model without states that otherwise has the same weights."""
+    full, stateless = (tiny_model(extrinsics=extrinsics, states=states) for states in (True, False))
+    shared = {name: full.predictor.state_dict()[name] for name in stateless.predictor.state_dict()}
+    stateless.predictor.load_state_dict(shared)
+    return full, stateless
 
 
-def inputs(*, extrinsics: bool = False, state_width: int = 7) -> list[Tensor]:
+def make_inputs(*, extrinsics: bool = False) -> list[Tensor]:
     latents = layer_norm(draw(2, STEPS, GRID**2, DIM), (DIM,))
-    given = [latents, draw(2, STEPS, 7, seed=2), draw(2, STEPS, state_width, seed=3)]
-    return [*given, draw(2, STEPS, 6, seed=4)] if extrinsics else given
+    inputs = [latents, draw(2, STEPS, 7, seed=2), draw(2, STEPS, 7, seed=3)]
+    return [*inputs, draw(2, STEPS, 6, seed=4)] if extrinsics else inputs
 
 
-def predicted_by_hand(full: WorldModel, latents: Tensor, actions: Tensor, cameras: list[Tensor]) -> Tensor:
-    """Send tokens through the blocks of a model with states, whose state tokens were never made."""
-    own, steps = full.predictor, latents.shape[1]
-    heads = [own.action_encoder(actions), *(own.extrinsics_encoder(camera) for camera in cameras)]
-    tokens = torch.cat([*(head[:, :, None] for head in heads), own.predictor_embed(latents)], dim=2)
+def predict_without_state_tokens(full: WorldModel, latents: Tensor, actions: Tensor, cameras: list[Tensor]) -> Tensor:
+    """Return the predictions of a model with states if its sequence has no state tokens."""
+    predictor, steps = full.predictor, latents.shape[1]
+    conditions = [predictor.action_encoder(actions), *(predictor.extrinsics_encoder(camera) for camera in cameras)]
+    patches = predictor.predictor_embed(latents)
+    tokens = torch.cat([*(condition[:, :, None] for condition in conditions), patches], dim=2)
     per_step = tokens.shape[2]
-    tables = rotary_tables(TokenLayout(steps, GRID, len(heads)), 12, tokens.device)
+    tables = rotary_tables(TokenLayout(steps, GRID, len(conditions)), 12, tokens.device)
     tokens = tokens.flatten(1, 2)
-    for block in own.blocks:
+    for block in predictor.blocks:
         tokens, _ = block(tokens, tables, per_step, "dense", 0)
-    patches = tokens.unflatten(1, (steps, per_step))[:, :, len(heads) :]
-    return layer_norm(own.predictor_proj(own.predictor_norm(patches)), (DIM,))
+    patches = tokens.unflatten(1, (steps, per_step))[:, :, len(conditions) :]
+    return layer_norm(predictor.predictor_proj(predictor.predictor_norm(patches)), (DIM,))
 
 
-@both
+@with_and_without_extrinsics
 @pytest.mark.parametrize("attention", ["dense", "per_step"])
 @torch.no_grad()
 def test_predictions_equal_those_of_a_model_with_states_after_removing_state_tokens(
     extrinsics: bool, attention: str
 ) -> None:
-    full, cut = pair(extrinsics=extrinsics)
-    cut.set_attention(attention)
-    latents, actions, states, *cameras = inputs(extrinsics=extrinsics)
-    expected = predicted_by_hand(full, latents, actions, cameras)
-    torch.testing.assert_close(cut.predict(latents, actions, states, *cameras), expected, atol=1e-5, rtol=1e-5)
-    assert (full.predict(latents, actions, states, *cameras) - expected).abs().max() > 1e-3, "a state matters to it"
+    full, stateless = make_models(extrinsics=extrinsics)
+    stateless.set_attention(attention)
+    latents, actions, states, *cameras = make_inputs(extrinsics=extrinsics)
+    expected = predict_without_state_tokens(full, latents, actions, cameras)
+    torch.testing.assert_close(stateless.predict(latents, actions, states, *cameras), expected, atol=1e-5, rtol=1e-5)
+    difference = (full.predict(latents, actions, states, *cameras) - expected).abs().max()
+    assert difference > 1e-3, "states must affect the model with states"
 
 
-@both
+@with_and_without_extrinsics
 @torch.no_grad()
 def test_states_of_any_value_and_width_do_not_change_predictions(extrinsics: bool) -> None:
-    cut = pair(extrinsics=extrinsics)[1]
-    latents, actions, states, *cameras = inputs(extrinsics=extrinsics)
-    expected = cut.predict(latents, actions, states, *cameras)
-    rolled = cut.rollout(latents[:, :1], actions, states, *cameras)
-    for other in (states + 1, draw(2, STEPS, 14), draw(2, STEPS, 1) * 1e9, states * float("nan")):
-        assert torch.equal(cut.predict(latents, actions, other, *cameras), expected)
-        assert torch.equal(cut.rollout(latents[:, :1], actions, other, *cameras), rolled)
-    assert not torch.equal(cut.predict(latents, actions + 1, states, *cameras), expected)
+    _, stateless = make_models(extrinsics=extrinsics)
+    latents, actions, states, *cameras = make_inputs(extrinsics=extrinsics)
+    expected = stateless.predict(latents, actions, states, *cameras)
+    expected_rollout = stateless.rollout(latents[:, :1], actions, states, *cameras)
+    for other_states in (states + 1, draw(2, STEPS, 14), draw(2, STEPS, 1) * 1e9, states * float("nan")):
+        assert torch.equal(stateless.predict(latents, actions, other_states, *cameras), expected)
+        assert torch.equal(stateless.rollout(latents[:, :1], actions, other_states, *cameras), expected_rollout)
+    assert not torch.equal(stateless.predict(latents, actions + 1, states, *cameras), expected)
 
 
 def test_adapter_on_the_missing_state_encoder_raises() -> None:

@@ -1,4 +1,4 @@
-"""The world model, its encoder, and the initial values of a fresh predictor."""
+"""The world model, its encoder, and the initial weights of a predictor."""
 
 import json
 import os
@@ -48,7 +48,7 @@ def break_sizes(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("damage", "message"),
     [
         (shutil.rmtree, "config.json: cannot be read: No such file or directory. Expected a folder written by"),
         (
@@ -63,10 +63,10 @@ def break_sizes(folder: Path) -> None:
     ],
 )
 def test_incomplete_model_folder_raises_with_its_path(
-    model: WorldModel, tmp_path: Path, spoil: Callable[[Path], None], message: str
+    model: WorldModel, tmp_path: Path, damage: Callable[[Path], None], message: str
 ) -> None:
     model.save_pretrained(tmp_path / "model")
-    spoil(tmp_path / "model")
+    damage(tmp_path / "model")
     with pytest.raises(InputError, match=message):
         WorldModel.from_pretrained(tmp_path / "model")
 
@@ -75,20 +75,20 @@ def test_model_without_its_encoder_predicts_as_before_and_keeps_the_fingerprint(
     model: WorldModel, fresh: Fresh, inputs, tmp_path: Path
 ) -> None:
     model.remove_encoder()
-    model.remove_encoder()  # once more changes nothing
-    whole = fresh(seed=0)
-    assert model.encoder_fingerprint() == whole.encoder_fingerprint()
-    assert sum(p.numel() for p in model.parameters()) == sum(p.numel() for p in whole.predictor.parameters())
+    model.remove_encoder()  # a second call has no effect
+    original = fresh(seed=0)
+    assert model.encoder_fingerprint() == original.encoder_fingerprint()
+    assert sum(p.numel() for p in model.parameters()) == sum(p.numel() for p in original.predictor.parameters())
     assert model.to("cpu").device == torch.device("cpu")
-    given = inputs.latents, inputs.actions, inputs.states
-    assert torch.equal(model.predict(*given), whole.predict(*given))
-    for needs_it in (lambda: model.encode(inputs.frames), lambda: model.save_pretrained(tmp_path / "model")):
+    arguments = inputs.latents, inputs.actions, inputs.states
+    assert torch.equal(model.predict(*arguments), original.predict(*arguments))
+    for use_encoder in (lambda: model.encode(inputs.frames), lambda: model.save_pretrained(tmp_path / "model")):
         with pytest.raises(ValueError, match="the encoder was removed"):
-            needs_it()
+            use_encoder()
 
 
 @pytest.mark.parametrize(
-    ("sizes", "complaint"),
+    ("sizes", "message"),
     [
         ({"predictor": {"depth": 10**9}}, "sizes: predictor.depth: Input should be less than or equal to 512"),
         ({"encoder": {"width": 16_384, "depth": 512, "heads": 128}}, "weights, more than"),
@@ -99,7 +99,7 @@ def test_model_without_its_encoder_predicts_as_before_and_keeps_the_fingerprint(
     ],
 )
 def test_folder_with_absurd_sizes_raises_before_memory_is_allocated(
-    model: WorldModel, tmp_path: Path, sizes: dict[str, Any] | None, complaint: str, monkeypatch: pytest.MonkeyPatch
+    model: WorldModel, tmp_path: Path, sizes: dict[str, Any] | None, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model.save_pretrained(tmp_path)
     card = json.loads((tmp_path / "config.json").read_text())
@@ -107,7 +107,7 @@ def test_folder_with_absurd_sizes_raises_before_memory_is_allocated(
     monkeypatch.setattr(WorldModel, "empty", None)
     with pytest.raises(InputError) as caught:
         WorldModel.from_pretrained(tmp_path)
-    assert complaint in str(caught.value)
+    assert message in str(caught.value)
     assert caught.value.where == f"{tmp_path / 'config.json'}: sizes"
 
 
@@ -119,7 +119,7 @@ def test_encoder_stays_frozen_and_in_eval_mode_during_training(model: WorldModel
     assert not model.encode(inputs.frames.requires_grad_()).requires_grad
 
 
-def sizes(width: int) -> ModelSizes:
+def make_sizes(width: int) -> ModelSizes:
     return ModelSizes(
         image_size=32,
         encoder=EncoderSizes(width=48, depth=1, heads=2, mlp_ratio=2.0),
@@ -127,7 +127,7 @@ def sizes(width: int) -> ModelSizes:
     )
 
 
-def likeness_to_the_input(model: WorldModel) -> Tensor:
+def measure_similarity_to_input(model: WorldModel) -> Tensor:
     latents = torch.nn.functional.layer_norm(
         torch.randn(2, 3, 4, 48, generator=torch.Generator().manual_seed(0)), (48,)
     )
@@ -135,9 +135,9 @@ def likeness_to_the_input(model: WorldModel) -> Tensor:
     return torch.cosine_similarity(model.predict(latents, zeros, zeros), latents, dim=-1).mean()
 
 
-@pytest.mark.parametrize(("width", "least"), [(48, 0.95), (64, 0.95), (32, 0.7)])
-def test_initialisation_near_persistence_copies_the_input(width: int, least: float) -> None:
-    copying = WorldModel.random(sizes(width), seed=0, near_persistence=True)
-    released = WorldModel.random(sizes(width), seed=0)
-    assert likeness_to_the_input(copying) > least
-    assert likeness_to_the_input(released) < 0.3
+@pytest.mark.parametrize(("width", "min_similarity"), [(48, 0.95), (64, 0.95), (32, 0.7)])
+def test_initialisation_near_persistence_copies_the_input(width: int, min_similarity: float) -> None:
+    near_persistence = WorldModel.random(make_sizes(width), seed=0, near_persistence=True)
+    released_recipe = WorldModel.random(make_sizes(width), seed=0)
+    assert measure_similarity_to_input(near_persistence) > min_similarity
+    assert measure_similarity_to_input(released_recipe) < 0.3
