@@ -107,7 +107,7 @@ def test_non_finite_model_returns_zero_actions_and_exits_with_status_1(
     broken.save_pretrained(tmp_path / "broken")
     out = tmp_path / "out"
     assert main(["simulate", str(tmp_path / "broken"), *TWICE, "--films", "0", "--out", str(out), *SMALL]) == 1
-    assert "broken: of 4 decisions no finite energy 4" in capsys.readouterr().out
+    assert "broken: 4 of 4 decisions: no finite energy" in capsys.readouterr().out
     steered, nothing = (metrics(out)["policies"][name]["by_episode"] for name in ("broken", "zero action"))
     assert steered["distance_cm"] == nothing["distance_cm"]
 

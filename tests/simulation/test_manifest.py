@@ -78,4 +78,4 @@ def test_damaged_manifest_is_refused_before_planning(
 
 def test_manifest_of_a_third_party_environment_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert simulate("model", tmp_path / "manifest.json", tmp_path, "--world", "true") == 2
-    assert "--seed determines the problems" in capsys.readouterr().err
+    assert "whose problems are determined by --seed" in capsys.readouterr().err

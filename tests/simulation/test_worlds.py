@@ -113,7 +113,7 @@ def test_unusable_environment_raises(model: str, world: str, said: str) -> None:
 
 def test_simulated_arm_options_with_world_raise(model: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", model, "--world", command(), "--task", "reach"]) == 2
-    assert "--task: simulate" in capsys.readouterr().err
+    assert "--task: used with --world" in capsys.readouterr().err
     assert main(["simulate", model, "--world", command(), "--domain", "B"]) == 2
     assert "--domain: simulate" in capsys.readouterr().err
     assert main(["simulate", model, "--world-timeout", "5"]) == 2
