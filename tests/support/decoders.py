@@ -1,4 +1,4 @@
-"""Decoders so small that they are trained in a second, on the frames of the tiny run."""
+"""Decoders that are trained within a second, on the frames of the tiny run."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -31,7 +31,7 @@ def make_decoder(make_config: MakeConfig, tmp_path: Path) -> MakeConfig:
 
 @pytest.fixture(scope="session")
 def whole_decoder(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, base_folder: Path) -> Path:
-    """The folder of the decoder of `make_decoder()`, which nothing disturbed: to be read only."""
+    """The folder of the decoder of `make_decoder()`, trained without interruption; tests must not change it."""
     folder = tmp_path_factory.mktemp("whole") / "decoder"
     with one_thread():
         return train_decoder(
@@ -47,9 +47,9 @@ def encode_split(tmp_path: Path) -> EncodeSplit:
         dataset = open_dataset(config.data)
         model = load_base(config.model, seed=config.seed)
         encoder = EncoderOnDevice.from_model(config, model, torch.device("cpu"))
-        wanted = select_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
+        requests = select_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
         files = LatentFiles(tmp_path / folder, "key")
-        encode_files(dataset, wanted, encoder, files, lossless_images=True)
-        return FramePairs.from_files(dataset, wanted, files)
+        encode_files(dataset, requests, encoder, files, lossless_images=True)
+        return FramePairs.from_files(dataset, requests, files)
 
     return encode

@@ -1,4 +1,4 @@
-"""Latent caches for tests: encoded with a tiny model, or of numbers that encode the step."""
+"""Latent caches for tests, encoded with a tiny model or with numbers that identify the step."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ NUMBERS = Encoding({"encoder": "numbers", "training.precision": "fp32"}, image_s
 
 
 def as_numbers(frames: np.ndarray) -> torch.Tensor:
-    """Return latents that hold the colour of a frame's middle, and so tell which frame it is."""
+    """Return latents that contain the colour of a frame's middle, which identifies the frame."""
     middle = torch.from_numpy(frames[:, frames.shape[1] // 2, frames.shape[2] // 2].astype(np.float32))
     return torch.cat([middle, middle, middle[:, :2]], dim=1)[:, None].repeat(1, NUMBERS.tokens, 1)
 
 
 def write_cache(dataset: Dataset, encoding: Encoding = NUMBERS, encode: Encode = as_numbers) -> Path:
-    """Write the cache of a data set where it is looked for, and return its folder."""
+    """Write the cache of a data set to its default folder, and return the folder."""
     cache = LatentCache.for_dataset(dataset, encoding)
     cache.begin()
-    for one in cache.requests:
+    for request in cache.requests:
         try:
-            episode = dataset.source.read(one.episode, one.camera)
-            frames = crop_frames(episode.read_frames(one.steps.tolist()), dataset.config.crop)
+            episode = dataset.source.read(request.episode, request.camera)
+            frames = crop_frames(episode.read_frames(request.steps.tolist()), dataset.config.crop)
         except InputError as error:
-            cache.files.record_broken(one.episode, one.camera, str(error))
+            cache.files.record_broken(request.episode, request.camera, str(error))
             continue
         latents = pack_latents(encode(frames), dataset.config.cache_dtype)
-        encoded = EncodedEpisode(episode, one.camera, one.steps.tolist(), latents, _squashed(frames, 16))
-        cache.files.write(one.episode, encoded)
+        encoded = EncodedEpisode(episode, request.camera, request.steps.tolist(), latents, _downsample(frames, 16))
+        cache.files.write(request.episode, encoded)
     return cache.folder
 
 
 def encode_for(config: Config, world_model: WorldModel, dataset: Dataset) -> Path:
-    """Encode a data set with the encoder of a model, as a run of this config would on the fly."""
+    """Encode a data set with the encoder of a model, as a run with this config would; return the cache's folder."""
 
     def encode(frames: np.ndarray) -> torch.Tensor:
         inputs = pixels_to_input(torch.from_numpy(np.ascontiguousarray(frames))[None], world_model.image_size)
@@ -61,19 +61,19 @@ def encode_for(config: Config, world_model: WorldModel, dataset: Dataset) -> Pat
     return write_cache(dataset, get_encoding(world_model, config), encode)
 
 
-def _squashed(frames: Frames, side: int) -> Frames:
-    """Return every so-many-th pixel of frames: square and small."""
+def _downsample(frames: Frames, side: int) -> Frames:
+    """Return frames of `side` x `side` evenly spaced pixels."""
     rows, columns = (np.arange(side) * length // side for length in frames.shape[1:3])
     return frames[:, rows][:, :, columns]
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
-    whole = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".partial"]
-    return {str(path.relative_to(folder)): path.read_bytes() for path in whole}
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".partial"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 def contents(folder: Path) -> dict[str, object]:
-    """Return everything in a cache; the order in the header of a file with latents is no matter."""
+    """Return the contents of all files of a cache, independently of the order of tensors in a header."""
     return {
         name: opened(folder / name) if name.endswith(".safetensors") else data
         for name, data in files_of(folder).items()

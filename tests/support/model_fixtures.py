@@ -39,7 +39,7 @@ def model() -> WorldModel:
 
 @pytest.fixture
 def fresh() -> Callable[..., WorldModel]:
-    """Make the model of the fixture `model` once more, or one of another seed or type."""
+    """Return a function that returns a new copy of the fixture `model`, or a model with another seed or data type."""
     return tiny_model
 
 
@@ -49,13 +49,14 @@ def inputs() -> Inputs:
 
 
 def tiny_model(seed: int = 0, dtype: torch.dtype = torch.float32) -> WorldModel:
-    """Return a model of one's own: a copy of what is drawn once for each seed and type."""
+    """Return a copy of a random model, which is drawn only once for each seed and data type."""
     return copy.deepcopy(_drawn(seed, dtype))
 
 
 def move_trained(model: WorldModel) -> list[Tensor]:
-    """Let every trained weight differ from its start; return these weights."""
-    generator, trained = torch.Generator().manual_seed(2), [one for one in model.parameters() if one.requires_grad]
+    """Change every trained weight, and return the trained weights."""
+    generator = torch.Generator().manual_seed(2)
+    trained = [value for value in model.parameters() if value.requires_grad]
     for value in trained:
         value.data += 0.05 * torch.randn(value.shape, generator=generator)
     return trained

@@ -1,4 +1,4 @@
-"""A decoder of a model's encoder that has learned nothing: quick to make, and its images are of the right size."""
+"""An untrained decoder for a model's encoder, whose images have the right size."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from vjepa2_ac.model.world_model import WorldModel
 
 
 def write_decoder(folder: Path, model: WorldModel, *, encoder: str | None = None) -> Path:
-    """Write the folder of a decoder for a model; with another fingerprint, for an encoder of the same size."""
+    """Write the folder of a decoder for a model; `encoder` replaces the fingerprint of the model's encoder."""
     patch = model.sizes.patch_size
     decoder = Decoder(DecoderShape("tiny", model.latent_dim, model.image_size // patch, patch))
     decoder.initialise(torch.Generator().manual_seed(0))

@@ -13,7 +13,7 @@ TOKENS, DIM = 9, 24
 
 
 def tiny_model(*, adapted: bool = False, extrinsics: bool = False, states: bool = True, depth: int = 2) -> WorldModel:
-    """Return a random model that heeds its actions; perhaps with an adapter that does something."""
+    """Return a random model that is sensitive to actions; optionally with an adapter that changes the predictions."""
     sizes = ModelSizes(
         image_size=48,
         encoder=EncoderSizes(width=DIM, depth=1, heads=2, mlp_ratio=2.0),
@@ -34,19 +34,19 @@ def tiny_model(*, adapted: bool = False, extrinsics: bool = False, states: bool 
 
 
 def vector_model(width: int, *, states: bool = True) -> WorldModel:
-    """Return a random model of states and actions of so many numbers."""
+    """Return a random model whose states and actions have `width` numbers."""
     sizes = tiny_model(states=states).sizes
     predictor = sizes.predictor.model_copy(update={"action_dim": width, "state_dim": width if states else 7})
     return WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0).eval()
 
 
 def draw(*shape: int, seed: int = 1) -> Tensor:
-    """Return normal numbers."""
+    """Return normally distributed random numbers."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
 def scene(*, extrinsics: bool = False) -> Scene:
-    """Return the frame and the state at a decision."""
+    """Return a random frame and state at a decision."""
     return Scene(draw(TOKENS, DIM), draw(7, seed=2) * 0.3, draw(6, seed=4) if extrinsics else None)
 
 
@@ -56,10 +56,10 @@ def actions(samples: int, steps: int, seed: int = 5) -> Tensor:
 
 
 def goal(goals: int = 1, **more: object) -> Goal:
-    """Return latents that are wanted."""
+    """Return goals with random latents."""
     return Goal(torch.nn.functional.layer_norm(draw(goals, TOKENS, DIM, seed=6), (DIM,)), **more)  # type: ignore[arg-type]
 
 
 def cost(model: WorldModel, **settings: object) -> WorldModelCost:
-    """Return the energy towards one goal from a scene."""
+    """Return the cost of plans from `scene` to `goal`."""
     return WorldModelCost(model, scene(), goal(), EnergyConfig(**settings))  # type: ignore[arg-type]
