@@ -119,7 +119,7 @@ def test_simulated_arm_options_with_world_raise(model: str, capsys: pytest.Captu
     assert main(["simulate", model, "--world-timeout", "5"]) == 2
     assert "--world-timeout: no --world" in capsys.readouterr().err
     assert main(["simulate", "record", "folder", "--world", command(), "--cameras", "3"]) == 2
-    assert "a world has one camera" in capsys.readouterr().err
+    assert "--world, which uses one camera" in capsys.readouterr().err
 
 
 WORLDS = ("robosuite", "libero", "metaworld")
