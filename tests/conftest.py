@@ -1,4 +1,4 @@
-"""What every test can use: checked shapes, the shared reference data, tiny settings."""
+"""Fixtures and settings for all tests: checks of array shapes, reference data, a tiny run."""
 
 import gc
 import os
@@ -10,8 +10,7 @@ from hypothesis import HealthCheck, settings
 
 import shape_checks
 
-# Where arrays change shape, each call with arrays is checked while testing. In the other packages it would double the
-# suite's time for what mypy proves already.
+# Modules whose array shapes are checked at each call during tests. Checks of all packages would double the duration.
 CHECKED = [
     "vjepa2_ac.spaces",
     "vjepa2_ac.media.images",
@@ -24,7 +23,7 @@ CHECKED = [
     "vjepa2_ac.simulation.motion",
 ]
 shape_checks.install(CHECKED, "beartype.beartype")
-# A busy machine is slow, and that is no fault of what is tested.
+# On a busy machine a test may be slow.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")
 
@@ -45,7 +44,7 @@ from run_fixtures import (  # noqa: E402, F401
 )
 from simulated import clone, simulated  # noqa: E402, F401
 
-# Begun first, each by a process of its own: whoever comes to them last would work alone in the end.
+# The longest files are started first, so that no process runs one of them alone at the end.
 LONGEST = (
     "test_notebook.py", "test_quickstart.py", "test_step.py", "test_benchmark.py", "test_counterfactual.py",
     "test_page.py", "test_memory.py", "test_end_to_end.py", "test_loop.py", "test_evaluate_run.py", "test_export.py",
@@ -61,11 +60,11 @@ SLOW = (
     "test_extending", "test_notebook", "test_quickstart", "test_site", "test_spot", "test_sweeps", "test_wheel",
     "training/test_soak",
 )  # fmt: skip
-"""Whole programs: `make test-slow`."""
+"""Tests of whole programs, which `make test-slow` runs."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files first that take longest, and mark what is slow."""
+    """Sort the longest files first, and mark slow tests."""
     places = {name: place for place, name in enumerate(LONGEST)}
     for item in items:
         name = os.path.relpath(item.path, ROOT / "tests")
@@ -76,7 +75,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Look for no garbage while all is imported, and never again in what is there then: half a second each time."""
+    """Disable garbage collection during the imports, and exclude the imported objects from later collections."""
     gc.disable()
     try:
         return (yield)
@@ -87,7 +86,7 @@ def pytest_collection() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The larger reference data, which stands beside the project's own checkout only."""
+    """The folder of the larger reference data, next to the checkout; tests are skipped if it is missing."""
     folder = ROOT.parent / "shared"
     if not folder.is_dir():
         pytest.skip("the larger reference data is not beside this checkout")
@@ -96,7 +95,7 @@ def shared() -> Path:
 
 @pytest.fixture(autouse=True, scope="session")
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Nothing of a test stays in the user's cache folder, and nothing in there helps a test."""
+    """Use a temporary cache folder instead of the user's."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VJEPA2_AC_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
@@ -104,7 +103,7 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def _without_fsync() -> Iterator[None]:
-    """No test waits for a disk: what `fsync` protects from, the loss of power, happens in none."""
+    """Skip `fsync`, which protects from power loss only, so that tests do not wait for the disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _: None)
         yield
@@ -112,7 +111,7 @@ def _without_fsync() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _ordinary_scheduling() -> Iterator[None]:
-    """No test leaves this process before all others (as SVT-AV1 does, as root): what it starts would starve them."""
+    """Check that no test gives this process real-time priority (as SVT-AV1 does for root), which slows down others."""
     yield
     if hasattr(os, "sched_getscheduler"):
         assert os.sched_getscheduler(0) == os.SCHED_OTHER
@@ -120,9 +119,9 @@ def _ordinary_scheduling() -> Iterator[None]:
 
 @pytest.fixture(autouse=True, scope="session")
 def _undrawn() -> Iterator[Callable[[pytest.MonkeyPatch], None]]:
-    """Figures are composed, strips with one column, and stay empty where `drawn` is not used.
+    """Skip the drawing of figures, and limit strips to one column, unless a test uses the fixture `drawn`.
 
-    Drawing is half of an evaluation's time.
+    Drawing takes half of an evaluation's time.
     """
     from matplotlib.figure import Figure
 
@@ -142,7 +141,7 @@ def _undrawn() -> Iterator[Callable[[pytest.MonkeyPatch], None]]:
 
 @pytest.fixture
 def drawn(_undrawn: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures have content."""
+    """Draw figures completely."""
     _undrawn(monkeypatch)
 
 
@@ -154,7 +153,7 @@ def _gcs() -> Iterator[gcs_server.Gcs]:
 
 @pytest.fixture
 def gcs(_gcs: gcs_server.Gcs, monkeypatch: pytest.MonkeyPatch) -> gcs_server.Gcs:
-    """A local Google Cloud Storage, empty; gs:// means it. What fails is tried again at once, 5 times in all."""
+    """An empty local Google Cloud Storage that serves gs://. Failed requests are retried at once, up to 5 times."""
     from vjepa2_ac.storage import retries
 
     _gcs.wipe()
@@ -165,7 +164,7 @@ def gcs(_gcs: gcs_server.Gcs, monkeypatch: pytest.MonkeyPatch) -> gcs_server.Gcs
 
 @pytest.fixture
 def traced(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What would be compiled is traced only, and runs as it is: a compiler would take a minute."""
+    """Trace functions instead of compiling them, which would take a minute."""
     import jaxtyping
     import torch._dynamo
     from torch._dynamo.utils import counters
@@ -175,7 +174,7 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(compilation, "BACKEND", "eager")
     torch._dynamo.reset()
     counters.clear()
-    jaxtyping.config.update("jaxtyping_disable", True)  # checks of shapes are not what is compiled
+    jaxtyping.config.update("jaxtyping_disable", True)  # the shape checks must not be traced
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
     torch._dynamo.reset()

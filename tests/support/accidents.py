@@ -1,4 +1,4 @@
-"""Accidents of a file: what disks, copies, editors and other users do to it."""
+"""Damage to files, as by disks, copies, editors and other users: missing permissions, changed bytes, failed writes."""
 
 import ctypes
 import os
@@ -39,7 +39,7 @@ def without_permission(*paths: Path) -> Iterator[None]:
 
 
 def mutated(data: bytes, generator: np.random.Generator) -> bytes:
-    """Return bytes after one accident: a flipped bit, a foreign, lost, repeated or blank stretch, an early end."""
+    """Return bytes with one random damage: a flipped bit, a replaced, deleted, doubled or zeroed part, truncation."""
     start = int(generator.integers(len(data)))
     end = min(len(data), start + int(2 ** generator.uniform(0, 12)))
     middle = {
@@ -54,11 +54,11 @@ def mutated(data: bytes, generator: np.random.Generator) -> bytes:
 
 
 class KilledError(BaseException):
-    """Stands for the end of the process: nothing is tidied up."""
+    """Simulates that the process is killed; no clean-up code catches it."""
 
 
 class Faults:
-    """Lets the n-th operation that changes a disk fail, whoever asks for it."""
+    """Makes the n-th operation that changes the disk fail, in any code."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.set()
@@ -67,7 +67,7 @@ class Faults:
             monkeypatch.setattr(where, name, self._failing(getattr(where, name)))
 
     def set(self, number: int = -1, error: BaseException | None = None) -> None:
-        """Count anew, and fail at an operation."""
+        """Restart the count of operations, and set the number of the operation that raises `error`."""
         self.done, self._fails_at, self._error = 0, number, error
 
     def _failing(self, real: Callable[..., Any]) -> Callable[..., Any]:

@@ -19,7 +19,7 @@ def write_adapted_run(
     config: Config, steps: tuple[int, ...] = (10, 20), best: int = 10, *, change: float = 0.3,
     rank: float | None = None, widths: Widths | None = None,
 ) -> Path:  # fmt: skip
-    """Write a run whose adapters do more at every checkpoint, or nothing with a change of 0; return its folder."""
+    """Write a run whose adapters change more at each checkpoint (not at all with a change of 0); return its folder."""
     folder = Path(config.run_dir)
     folder.mkdir(parents=True)
     (folder / CONFIG).write_text(config_as_yaml(config))

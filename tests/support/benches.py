@@ -1,4 +1,4 @@
-"""Benchmarks, imported as where they lie, for they import each other by their bare names."""
+"""Import of benchmarks, which import each other without a package name."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -13,10 +13,10 @@ from paths import ROOT
 
 @pytest.fixture
 def load(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Any]]:
-    """Import benchmarks by their names; nothing of them stays."""
+    """A function that imports a benchmark by its name. Imported modules are removed after the test."""
     threads, before = torch.get_num_threads(), set(sys.modules)
     monkeypatch.setattr(sys, "path", [str(ROOT / "benchmarks"), *sys.path])
-    monkeypatch.delitem(sys.modules, "planning", raising=False)  # a folder of tests has this name, too
+    monkeypatch.delitem(sys.modules, "planning", raising=False)  # a folder of tests has the same name
     yield import_module
     torch.set_num_threads(threads)
     own = {path.stem for path in (ROOT / "benchmarks").glob("*.py")} | {"src", "notebooks"}

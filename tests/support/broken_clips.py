@@ -1,6 +1,6 @@
-"""The command line, for which the third and the fourth of all held-out clips are broken.
+"""Run the command line so that the third and the fourth held-out clip cannot be read.
 
-The parts of processes that share seven clips, in batches of two or three, begin or end there.
+If processes share seven clips in batches of two or three, these clips are at the boundary of a process's share.
 """
 
 import sys
@@ -16,19 +16,19 @@ if __name__ == "__main__":
     broken: set[tuple[int, int]] = set()
     choose, read = loader.validation_windows, loader.read_clip
 
-    def chosen(*given: object, **named: object) -> object:
-        found = choose(*given, **named)  # type: ignore[arg-type]
-        broken.update(found[2:4])
-        return found
+    def choose_and_break(*args: object, **kwargs: object) -> object:
+        windows = choose(*args, **kwargs)  # type: ignore[arg-type]
+        broken.update(windows[2:4])
+        return windows
 
-    def some_read(dataset: loader.Dataset, wish: loader.ClipRequest) -> object:
-        if (wish.episode, wish.start) in broken:
+    def read_unless_broken(dataset: loader.Dataset, request: loader.ClipRequest) -> object:
+        if (request.episode, request.start) in broken:
             raise InputError(where="a clip", found="its image is damaged")
-        return read(dataset, wish)
+        return read(dataset, request)
 
     with (
-        mock.patch.object(evaluate_run, "validation_windows", chosen),
-        mock.patch.object(validation, "validation_windows", chosen),
-        mock.patch.object(loader, "read_clip", some_read),
+        mock.patch.object(evaluate_run, "validation_windows", choose_and_break),
+        mock.patch.object(validation, "validation_windows", choose_and_break),
+        mock.patch.object(loader, "read_clip", read_unless_broken),
     ):
         sys.exit(main(sys.argv[1:]))

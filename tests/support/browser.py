@@ -1,4 +1,4 @@
-"""A real browser, headless, for tests of pages: what it makes of a page, complains of and asks the network for."""
+"""A headless browser for tests of pages: the resulting DOM, console messages and network requests."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from pathlib import Path
 import pytest
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome")
-_PATIENCE_S = 120  # on a busy machine
+_TIMEOUT_S = 120  # long enough for a busy machine
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What came of opening a page."""
+    """The result of opening a page."""
 
     dom: str
     console: tuple[str, ...]
-    requests: tuple[str, ...]  # of the page, not the browser's own
+    requests: tuple[str, ...]  # requests of the page, without those of the browser itself
 
 
 def browser() -> str:
     """Return the browser's path, or skip the test."""
-    found = next(filter(None, map(shutil.which, _NAMES)), None)
-    if found is None:
-        pytest.skip(f"no browser here: none of {', '.join(_NAMES)} is installed")
-    return found
+    path = next(filter(None, map(shutil.which, _NAMES)), None)
+    if path is None:
+        pytest.skip(f"no browser: none of {', '.join(_NAMES)} is installed")
+    return path
 
 
 def open_page(page: Path, folder: Path, *, dark: bool = False) -> Seen:
@@ -42,7 +42,7 @@ def open_page(page: Path, folder: Path, *, dark: bool = False) -> Seen:
             f"--user-data-dir={folder / 'profile'}", f"--blink-settings=preferredColorScheme={int(not dark)}",
             "--window-size=1600,900", "--virtual-time-budget=2000", "--dump-dom", page.as_uri(),
         ],
-        capture_output=True, text=True, check=True, timeout=_PATIENCE_S,
+        capture_output=True, text=True, check=True, timeout=_TIMEOUT_S,
     )  # fmt: skip
     console = tuple(line for line in done.stderr.splitlines() if ":CONSOLE" in line)
     return Seen(done.stdout, console, _requests_of_the_page(log))
@@ -50,5 +50,5 @@ def open_page(page: Path, folder: Path, *, dark: bool = False) -> Seen:
 
 def _requests_of_the_page(log: Path) -> tuple[str, ...]:
     parameters = [event.get("params", {}) for event in json.loads(log.read_text(encoding="utf-8"))["events"]]
-    asked = [each for each in parameters if re.match("https?:|ftp:|wss?:", str(each.get("url", "")))]
-    return tuple(str(each["url"]) for each in asked if each.get("initiator", "not an origin") != "not an origin")
+    requests = [event for event in parameters if re.match("https?:|ftp:|wss?:", str(event.get("url", "")))]
+    return tuple(str(event["url"]) for event in requests if event.get("initiator", "not an origin") != "not an origin")

@@ -16,18 +16,18 @@ from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.episode import Batch, Clip, EpisodeSource
 
 
-def open_in_memory(source: Any, /, **knobs: Any) -> Dataset:
-    """Open the data set of a source, with all episodes in training unless the knobs say otherwise."""
+def open_in_memory(source: Any, /, **options: Any) -> Dataset:
+    """Open the data set of a source. By default all episodes are in the training split."""
     all_train = {"validation_share": 0.0, "test_share": 0.0, "workers": 0}
-    values = {"path": "the set", "frames": 3, "stride": 2} | all_train | knobs
+    values = {"path": "the set", "frames": 3, "stride": 2} | all_train | options
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(opening, "open_source", lambda _: source)
         return opening.open_dataset(DataConfig.model_validate(values))
 
 
-def dataset_in_memory(source: EpisodeSource, /, **knobs: Any) -> Dataset:
-    """Return the data set of a source as it is: no filter looks at it."""
-    config = DataConfig.model_validate({"path": "memory", "frames": 3, **knobs})
+def dataset_in_memory(source: EpisodeSource, /, **options: Any) -> Dataset:
+    """Return the data set of a source without filters."""
+    config = DataConfig.model_validate({"path": "memory", "frames": 3, **options})
     table = EpisodeTable.from_infos(source.infos())
     kept = StepSelection.all_steps(table, np.ones(len(table), bool))
     return Dataset(config, source, table, kept, BrokenEpisodes(config, len(table)))
@@ -39,7 +39,7 @@ def clip_at(dataset: Dataset, episode: int, start: int, *, camera: str | None = 
 
 
 def split_of(name: str, config: DataConfig) -> Split:
-    """Return the split of an episode or group: the law, written a second time."""
+    """Return the split of an episode or group, computed independently of the package."""
     number = hash_identity(name) / 2**64
     if number < config.test_share:
         return "test"
@@ -47,12 +47,12 @@ def split_of(name: str, config: DataConfig) -> Split:
 
 
 def some_clips(batch: Batch, chosen: list[int]) -> Batch:
-    """Return a batch with some of its clips; the others could not be read."""
+    """Return a batch with the clips at the given indices, as if the other clips could not be read."""
     return replace(
         batch,
         frames=batch.frames[chosen],
         states=batch.states[chosen],
         actions=batch.actions[chosen],
-        episode_ids=tuple(batch.episode_ids[place] for place in chosen),
-        starts=tuple(batch.starts[place] for place in chosen),
+        episode_ids=tuple(batch.episode_ids[index] for index in chosen),
+        starts=tuple(batch.starts[index] for index in chosen),
     )

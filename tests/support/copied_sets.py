@@ -1,4 +1,4 @@
-"""What does a data set look like in which an episode is there twice? The same recording under another name."""
+"""Data sets of several formats in which a recording occurs several times, under different names."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIZE = (24, 32)
 
 
 def write_npz(folder: Path, recordings: Sequence[int], **texts: Callable[[int], str]) -> Path:
-    """Write episodes NNN.npz, each of the recording of a number; texts by the place of the episode."""
+    """Write episodes NNN.npz. Equal numbers give equal recordings; `texts` are functions of the episode's index."""
     folder.mkdir(parents=True, exist_ok=True)
     for place, number in enumerate(recordings):
         states = synthetic_states(STEPS, seed=number)
@@ -29,7 +29,7 @@ def write_npz(folder: Path, recordings: Sequence[int], **texts: Callable[[int], 
 
 
 def write_rlds(folder: Path, recordings: Sequence[int]) -> Path:
-    """Write DROID's RLDS likewise; the copy's name is longer, past what one byte counts."""
+    """Write a data set in DROID's RLDS format. The names from the fifth episode on are longer than 127 bytes."""
 
     def episodes() -> list:  # type: ignore[type-arg]  # of DroidEpisode
         made = []
@@ -43,12 +43,12 @@ def write_rlds(folder: Path, recordings: Sequence[int]) -> Path:
 
 
 def write_lerobot(folder: Path, recordings: Sequence[int]) -> Path:
-    """Write LeRobot v3.0 likewise."""
+    """Write a data set in LeRobot's format v3.0."""
     return write_v30(folder, [recorded(number, STEPS, size=SIZE) for number in recordings], episodes_per_video=1)
 
 
 def write_raw(folder: Path, recordings: Sequence[int]) -> Path:
-    """Write raw DROID likewise."""
+    """Write a data set in DROID's raw format."""
     for place, number in enumerate(recordings):
         states = synthetic_states(STEPS, seed=number)
         frames = {"1234": [draw_frame(state, size=SIZE) for state in states]}

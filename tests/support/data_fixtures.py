@@ -1,4 +1,4 @@
-"""A small data set in DROID's schema, drawn and written by our own writer, and ways to spoil it."""
+"""A small synthetic data set in DROID's schema, and copies with a changed record."""
 
 import shutil
 from collections.abc import Callable
@@ -16,7 +16,7 @@ Features = dict[str, tuple[Any, Any]]
 
 @pytest.fixture(scope="session")
 def droid(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six episodes of 12 to 17 steps in two shards, small pictures. Read only."""
+    """Six episodes of 12 to 17 steps in two shards, with small images. Read only."""
     return write_synthetic_droid(
         tmp_path_factory.mktemp("droid") / "1.0.0", steps=range(12, 18), episodes=6, size=(48, 96), shards=2
     )
@@ -24,7 +24,7 @@ def droid(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def spoiled(droid: Path, tmp_path: Path) -> Callable[[Callable[[Features], None]], Path]:
-    """Copy the data set with the first record changed by a function of its features; its CRC is right."""
+    """Copy the data set, and change the features of the first record by a function; the CRC is correct."""
 
     def spoil(change: Callable[[Features], None]) -> Path:
         folder = tmp_path / "spoiled"

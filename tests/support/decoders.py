@@ -21,7 +21,7 @@ EncodeSplit = Callable[..., FramePairs]
 
 @pytest.fixture
 def make_decoder(make_config: MakeConfig, tmp_path: Path) -> MakeConfig:
-    """Return a config of a tiny decoder, in the folder `decoder`; knobs of the decoder, and dotted keys, change it."""
+    """A function that returns the config of a tiny decoder, with changed decoder options and other config keys."""
 
     def make(folder: str = "decoder", knobs: dict | None = None, **changes: object) -> Config:
         return make_config(decoder={**KNOBS, "folder": str(tmp_path / folder), **(knobs or {})}, **changes)

@@ -1,6 +1,6 @@
-"""What test_agreement.py starts twice: a rank of a training run that meets something the other rank does not.
+"""One rank of a training run with a fault that only one of the ranks has; tests start two of them.
 
-Arguments: a config, and what happens (a function below).
+Arguments: a config, and the name of the fault, which is a function below.
 """
 
 import os
@@ -27,7 +27,7 @@ RANK = int(os.environ["RANK"])
 
 
 def measures_otherwise() -> None:
-    """The other rank's errors differ in the last digits: what is no better for one is better for the other."""
+    """The validation errors of the ranks differ in the last digits, so that only one rank measures an improvement."""
     measure, times = validation.prediction_errors, [0]
 
     def measured(*given: object, **named: object) -> object:
@@ -54,7 +54,7 @@ def index_cannot_be_made() -> None:
 
 
 def one_is_killed_once() -> None:
-    """Under a launcher that starts all again."""
+    """The launcher must restart all ranks."""
     step = loop.training_step
 
     def killed(run: object, batches: object, number: int, **given: object) -> object:

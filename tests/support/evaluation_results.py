@@ -137,7 +137,7 @@ def evaluation(
     *, episodes: int = 12, clips: int = 48, frames: int = 4, with_base: bool = True, others: tuple[str, ...] = (),
     size: int = 64, id_form: str = "AUTOLab/success/2023-07-0{0}/Fri_{0}",
 ) -> Evaluation:  # fmt: skip
-    """Return an evaluation of which everything was measured."""
+    """Return an evaluation with all measurements."""
     rng = np.random.default_rng(0)
     horizon = frames - 1
     ids = tuple(id_form.format(clip % episodes) for clip in range(clips))

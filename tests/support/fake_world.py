@@ -1,4 +1,4 @@
-"""A world as a program: a hand is to come to a place that its seed determines. Its argument says what is wrong."""
+"""An environment program in which a hand must reach a position drawn from the seed. Its argument selects a fault."""
 
 import base64
 import json
@@ -9,7 +9,7 @@ import numpy as np
 
 HOW = sys.argv[1] if len(sys.argv) > 1 else "as it should be"
 ABOUT = {"world": "fake 1.0", "task": "Come", "instruction": "come here", "rate_hz": 10, "steps": 12, "expert": True}
-REACH_M = 0.03  # of a control step
+REACH_M = 0.03  # largest motion per control step
 
 
 def place_of(seed: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A Google Cloud Storage for tests: the emulator, in memory, with connections that stay and failures on demand."""
+"""An emulator of Google Cloud Storage in memory, with persistent connections and failures on demand."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ Failure = int | str
 
 @dataclass(frozen=True)
 class Request:
-    """One request that came in, and how it was answered."""
+    """A received request and the size of its answer."""
 
-    target: str  # "METHOD /address", unquoted; of an upload with the object's name behind it
-    object: str  # "bucket/name" of the object whose bytes were asked for; else ""
-    sent: int  # bytes of the body
+    target: str  # "METHOD /address", unquoted; for an upload followed by the object's name
+    object: str  # "bucket/name" of the object whose bytes were requested; "" for other requests
+    sent: int  # bytes of the answer's body
 
 
 @dataclass
@@ -49,12 +49,12 @@ class _Meeting:
 
 
 class Gcs:
-    """What a test tells the storage, and asks it. A test begins with an empty one without faults.
+    """The interface of tests to the storage. At the start of a test the storage is empty and has no faults.
 
     Attributes:
-        url: Where it answers; STORAGE_EMULATOR_HOST is set to it.
-        requests: All that came in, in the order of the answers.
-        most_in_flight: Most requests that were open at the same time.
+        url: Address of the storage; STORAGE_EMULATOR_HOST is set to it.
+        requests: All requests, in the order of the answers.
+        most_in_flight: Maximum number of simultaneous requests.
     """
 
     def __init__(self) -> None:
@@ -85,33 +85,33 @@ class Gcs:
         return f"gs://{place}"
 
     def fail_next(self, failure: Failure, *, times: int = 1, match: str = "") -> None:
-        """Let the next requests fail.
+        """Make the next requests fail.
 
         Args:
             failure: An HTTP status. "reset": the connection is closed. "cut": it is closed in the middle of the body.
-                "short": half the body is sent as if it were all. "hang": no answer until the client goes.
-            times: How many requests.
+                "short": only half of the body is sent, with this length. "hang": no answer before the client leaves.
+            times: Number of requests that fail.
             match: Regular expression that is searched in the unquoted "METHOD /address"; empty: any request. Bytes of
-                objects are asked for with "GET /download/storage/v1/b/BUCKET/o/NAME".
+                objects are requested with "GET /download/storage/v1/b/BUCKET/o/NAME".
         """
         with self._lock:
             self._faults.append(_Fault(failure, times, match))
 
     def hold(self, number: int, match: str) -> None:
-        """Answer no request of such an address before so many requests were open at the same time, or 30 s are over."""
+        """Delay the answers to matching requests until `number` requests are open at the same time, at most 30 s."""
         self._meeting = _Meeting(number, match, time.monotonic() + _PATIENCE_S)
 
     @property
     def faults_left(self) -> int:
-        """How many of the faults asked for have not happened."""
+        """Number of faults set by `fail_next` that have not occurred yet."""
         return sum(fault.times for fault in self._faults)
 
     def reads(self, end: str = "") -> list[Request]:
-        """Return the requests for bytes of objects whose "bucket/name" ends so."""
+        """Return the requests for bytes of objects whose "bucket/name" ends with `end`."""
         return [request for request in self.requests if request.object.endswith(end) and request.object]
 
     def uploads(self) -> list[Request]:
-        """Return the requests that brought bytes of objects."""
+        """Return the requests that uploaded bytes of objects."""
         return [request for request in self.requests if request.target.startswith("POST /upload/")]
 
     def names(self, bucket: str) -> list[str]:
@@ -119,18 +119,18 @@ class Gcs:
         return sorted(self._storage.objects.get(bucket, {}))
 
     def bytes_read(self, end: str = "") -> int:
-        """Return how many bytes of such objects were sent."""
+        """Return the number of bytes that were sent for objects whose "bucket/name" ends with `end`."""
         return sum(request.sent for request in self.reads(end))
 
     def forget(self) -> None:
-        """Forget requests, faults and what is held; the objects stay."""
+        """Delete requests, faults and delays, but not the objects."""
         with self._lock:
             self._faults.clear()
             self.requests.clear()
             self._meeting, self.most_in_flight = _Meeting(0, ""), 0
 
     def wipe(self) -> None:
-        """Forget everything, also what a client gave up waiting for."""
+        """Wait for open requests, which a client may have abandoned, and delete everything."""
         with self._lock:
             self._lock.wait_for(lambda: self._in_flight == 0, timeout=120)
         self.forget()
@@ -162,12 +162,12 @@ class _Server(ThreadingHTTPServer):
     request_queue_size = 256
 
     def handle_error(self, *_: object) -> None:
-        """Say nothing: the client was killed."""
+        """Print nothing, because the client was killed."""
 
 
 @contextmanager
 def running() -> Iterator[Gcs]:
-    """Start the storage on a free port of this machine; stop it in the end."""
+    """Run the storage on a free local port within the context."""
     gcs = Gcs()
     with _Server(("127.0.0.1", 0), partial(_Handler, gcs)) as server:
         gcs.url = f"http://127.0.0.1:{server.server_port}"
@@ -179,7 +179,7 @@ def running() -> Iterator[Gcs]:
 
 
 class _Handler(RequestHandler):
-    """Answers the requests of one connection, which stays."""
+    """Answers the requests of one persistent connection."""
 
     protocol_version = "HTTP/1.1"
 
@@ -197,7 +197,7 @@ class _Handler(RequestHandler):
             gcs._wait_for_others(target)
             failure = gcs._failure_of(target)
             if failure is None and target.startswith("DELETE /upload/"):
-                failure = 499  # as Google answers to whoever gives an upload up; the emulator does not know it
+                failure = 499  # Google's answer to a cancelled upload, which the emulator does not implement
             if failure == "hang":
                 connection.read()
             answer, sent = self._result(failure, body)
@@ -210,7 +210,7 @@ class _Handler(RequestHandler):
     do_GET = do_POST = do_DELETE = do_PUT = do_PATCH = _answer  # noqa: N815 - the names that http.server calls
 
     def _result(self, failure: Failure | None, body: bytes) -> tuple[bytes, int]:
-        """Return all bytes to send, and how many of them are body."""
+        """Return all bytes to send, and the number of bytes of the body."""
         if failure in {"reset", "hang"}:
             return b"", 0
         if isinstance(failure, int):

@@ -1,4 +1,4 @@
-"""The commands that guides show, and what makes them take seconds."""
+"""The commands of the guides, and options with which they take only seconds."""
 
 import re
 
@@ -18,7 +18,7 @@ SHORTER = {  # by the first words of a command
 
 
 def commands_of(text: str) -> list[str]:
-    """Return the commands of a page, or of a part of it, without comments; continued lines are one."""
+    """Return the commands of a page, or of a part of a page, without comments; continued lines are joined."""
     blocks = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
     shown = [re.sub(r"\s+", " ", re.sub(r"(^|\s)#\s.*", "", line)).strip() for line in lines]
@@ -26,6 +26,6 @@ def commands_of(text: str) -> list[str]:
 
 
 def shorter(command: str) -> list[str]:
-    """Return further words of a command of this program, so that it takes seconds."""
+    """Return additional options for a command, with which it takes only seconds."""
     words = command.removeprefix("vjepa2-ac ")
     return next((less.split() for start, less in SHORTER.items() if f"{words} ".startswith(f"{start} ")), [])

@@ -1,4 +1,4 @@
-"""What does the Hugging Face Hub answer? As much of its API as reading data and models needs, served from folders."""
+"""A local Hugging Face Hub that serves folders, with the part of the API that reading data and models needs."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ _COMMIT = "0" * 40
 
 @dataclass
 class Hub:
-    """A local Hub: data sets and models by name; some of them only for those with a token."""
+    """A local Hub: data sets and models by name, some of which require a token."""
 
     datasets: Mapping[str, Path]
-    gated: Mapping[str, str] = field(default_factory=dict)  # name -> the token that opens it
+    gated: Mapping[str, str] = field(default_factory=dict)  # name -> required token
     url: str = ""
 
 
 @contextmanager
 def serve_hub(datasets: Mapping[str, Path], gated: Mapping[str, str] | None = None) -> Iterator[Hub]:
-    """Serve folders as data sets or models at a free port of this machine, where huggingface_hub finds them."""
+    """Serve folders as data sets or models on a free local port, and make huggingface_hub use this port."""
     hub = Hub(datasets, gated or {})
     server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"hub": hub}))
     hub.url = f"http://127.0.0.1:{server.server_port}"
@@ -46,7 +46,9 @@ def serve_hub(datasets: Mapping[str, Path], gated: Mapping[str, str] | None = No
         with pytest.MonkeyPatch.context() as patch:
             from huggingface_hub import constants, hf_file_system
 
-            patch.setenv("HF_ENDPOINT", hub.url)  # read once, at import: so the constants, too
+            patch.setenv(
+                "HF_ENDPOINT", hub.url
+            )  # also set as constants, because huggingface_hub reads it only at import
             patch.setattr(constants, "ENDPOINT", hub.url)
             patch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", hub.url + _URL_TEMPLATE)
             patch.setattr(constants, "HF_TOKEN_PATH", f"{__file__}.no-token")
@@ -118,13 +120,13 @@ class _Handler(BaseHTTPRequestHandler):
             self._json(404, {"error": "Entry not found"}, "EntryNotFound")
             return
         data = file.read_bytes()
-        asked = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
-        start = int(asked[1]) if asked else 0
-        end = min(int(asked[2]) + 1, len(data)) if asked and asked[2] else len(data)
+        byte_range = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
+        start = int(byte_range[1]) if byte_range else 0
+        end = min(int(byte_range[2]) + 1, len(data)) if byte_range and byte_range[2] else len(data)
         if start >= len(data):
             self._json(416, {"error": "out of range"})
             return
-        self.send_response(206 if asked else 200)
+        self.send_response(206 if byte_range else 200)
         self.send_header("Content-Range", f"bytes {start}-{end - 1}/{len(data)}")
         self.send_header("ETag", f'"{hashlib.sha256(data).hexdigest()}"')
         self.send_header("X-Repo-Commit", _COMMIT)
@@ -144,4 +146,4 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(data)
 
     def log_message(self, *_: object) -> None:
-        """Stay silent."""
+        """Print nothing."""

@@ -1,4 +1,4 @@
-"""Packages of others that a test tries, installed for it alone, and packages of a user."""
+"""Installation of third-party packages for a single test, and simulated packages of a user."""
 
 import importlib
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 
 
 def install(python: str | Path, *words: str) -> None:
-    """Install packages for a Python, or skip aloud."""
+    """Install packages for a Python interpreter; skip the test if they cannot be installed."""
     pip = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--disable-pip-version-check"]
     try:
         done = subprocess.run([*pip, *words], capture_output=True, text=True, timeout=180)
@@ -20,7 +20,7 @@ def install(python: str | Path, *words: str) -> None:
 
 
 def leave_package(folder: Path, package: str, entry_points: str, code: str = "thing = print\n") -> None:
-    """Leave in a folder what the installation of a package leaves."""
+    """Write the files of an installed package into a folder: its metadata, entry points and module."""
     about = folder / f"{package}-1.0.dist-info"
     about.mkdir(parents=True, exist_ok=True)
     (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")

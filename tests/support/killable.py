@@ -1,7 +1,7 @@
 """Processes that start at once, and runs killed with SIGKILL at chosen moments.
 
-Starting Python with PyTorch takes seconds. A `Nursery` is a process that has imported everything, done nothing yet and
-has one thread; it forks a child per start, which runs the command line as any process does and dies as any does.
+Starting Python with PyTorch takes seconds. A `Nursery` is a single-threaded process that has imported all libraries. It
+forks a child for each start, which runs the command line and exits like any other process.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ class Nursery:
     def start(
         self, *arguments: str, folder: Path, die_at: int | None = None, out: str = os.devnull, err: str | None = None
     ) -> Child:
-        """Start a command; it kills itself when it is about to do its `die_at`-th change to the files in a folder.
+        """Start a command that kills itself before its `die_at`-th change to the files in a folder.
 
-        Its standard output is the file `out`; its standard error the file `err`, else that of this process.
+        Standard output is written to the file `out`, standard error to the file `err` or that of this process.
         """
         wish = {"arguments": arguments, "folder": str(folder), "die_at": die_at, "out": out, "err": err}
         return Child(self._ask(wish), self)
 
     def start_script(self, *words: str, environment: dict[str, str], out: str, err: str) -> Child:
-        """Start `python SCRIPT …`, or `python -m vjepa2_ac.cli …`, in another environment, in the present folder."""
+        """Start `python SCRIPT …`, or `python -m vjepa2_ac.cli …`, in the current folder with another environment."""
         wish = {"die_at": None, "out": out, "err": err, "environment": environment, "cwd": str(Path.cwd())}
         wish |= {"arguments": words[2:]} if words[0] == "-m" else {"script": words[0], "arguments": words[1:]}
         return Child(self._ask(wish), self)
 
     def run(self, *words: str, folder: Path) -> subprocess.CompletedProcess[str]:
-        """Do as `start_script` in this environment, to its end; what it prints goes through files in a folder."""
+        """Run a script as `start_script` does, in this environment, and wait; `folder` stores the output."""
         out, err = folder / "stdout.txt", folder / "stderr.txt"
         for file in (out, err):
             file.write_text("")
@@ -64,7 +64,7 @@ class Nursery:
         return subprocess.CompletedProcess(words, child.wait(), out.read_text(), err.read_text())
 
     def wait_for(self, child: int) -> int:
-        """Wait for a child; return its status, negative where a signal ended it."""
+        """Wait for a child; return its exit status, or minus the signal that ended it."""
         return self._ask({"wait": child})
 
     def close(self) -> None:
@@ -82,7 +82,7 @@ class Nursery:
 
 @cache
 def nursery() -> Nursery:
-    """The nursery of this test process, for as long as it lives."""
+    """Return the nursery of this test process, which exists until the process exits."""
     made = Nursery()
     atexit.register(made.close)
     return made
@@ -105,7 +105,7 @@ class Child:
         return self.nursery.wait_for(self.pid)
 
     def kill_after(self, delay_s: float) -> int:
-        """Let it run for a while, then kill it; return its status, which is another one where it was done before."""
+        """Kill the child after a delay; return its exit status, which is not KILLED if it exited earlier."""
         until = time.monotonic() + delay_s
         while time.monotonic() < until and self.is_running():
             time.sleep(0.0005)
@@ -118,7 +118,7 @@ class Child:
 
 
 def wait_for_the_end_of(sessions: set[int], timeout_s: float) -> list[psutil.Process]:
-    """Wait until no process of these sessions is left; return those that stay."""
+    """Wait until no process of these sessions is left; return the processes that are left after the timeout."""
     left = [process for process in psutil.process_iter() if _session(process.pid) in sessions]
     return psutil.wait_procs(left, timeout=timeout_s)[1]
 
@@ -131,7 +131,7 @@ def _session(process: int) -> int:
 
 
 def _serve() -> None:
-    """Fork a child for each line of the standard input; tell its number, and later its status."""
+    """Fork a child for each request on standard input, and print its process id; on request print its exit status."""
     import torch
 
     import vjepa2_ac.cli.progress
@@ -157,7 +157,7 @@ def _tell(number: int) -> None:
 
 
 def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
-    """Be a process that runs a command, and nothing else."""
+    """Run a command in this forked process, and exit."""
     status = 1
     try:
         os.setsid()  # its workers are in its session, and known by it when it is dead
@@ -202,10 +202,10 @@ def _script(wish: dict) -> int:
 
 
 def _die_at(number: int, folder: str) -> None:
-    """Kill this process when it is about to change the files of a folder for the n-th time.
+    """Kill this process before its n-th change to the files of a folder.
 
-    Python tells of every file that is opened, renamed or removed. Those that a library writes by itself show in the
-    opening that follows, to flush or to hash them.
+    Python's audit events report each file that is opened, renamed or removed. Files that native code writes are noticed
+    when they are opened afterwards, to flush or to hash them.
     """
     left = number
     changes = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir"}

@@ -1,4 +1,4 @@
-"""What do LeRobot data sets look like? Real ones, v3.0 and v2.1, written with pyarrow and PyAV."""
+"""Write LeRobot data sets, v3.0 and v2.1, with pyarrow and PyAV."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Frames = list[UInt8[np.ndarray, "height width 3"]]
 
 @dataclass(frozen=True)
 class Recorded:
-    """One episode as it is to be written: columns of [steps, numbers], pictures of each camera."""
+    """One episode to write: columns of [steps, numbers], and the frames of each camera."""
 
     columns: Mapping[str, np.ndarray]
     frames: Mapping[str, Frames]
@@ -42,7 +42,7 @@ class Recorded:
 
 
 def recorded(number: int, steps: int, *, size: tuple[int, int] = SIZE) -> Recorded:
-    """Return an episode as DROID's ports have it; each picture tells its episode, step and camera."""
+    """Return an episode with the columns of DROID's ports; each frame encodes its episode, step and camera."""
     states = synthetic_states(steps, seed=number).astype(np.float32)
     columns = {
         STATE[0]: states[:, :6],
@@ -61,7 +61,7 @@ def recorded(number: int, steps: int, *, size: tuple[int, int] = SIZE) -> Record
 
 
 def numbered(frame: UInt8[np.ndarray, "height width 3"], *numbers: int) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a picture with numbers below 256 in its upper rows, as black and white blocks that a codec keeps."""
+    """Return an image with numbers below 256 in its upper rows, as black and white blocks that a codec preserves."""
     frame = frame.copy()
     for row, number in enumerate(numbers):
         for bit in range(8):
@@ -131,13 +131,13 @@ def write_v21(folder: str | Path, episodes: Sequence[Recorded], *, gop: int = 2,
 
 
 def change_info(root: Path, **changes: object) -> None:
-    """Change what meta/info.json says."""
+    """Change values of meta/info.json."""
     path = root / "meta/info.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
 def change_table(path: Path, **columns: object) -> None:
-    """Replace columns of a Parquet file, or take them out (None)."""
+    """Replace columns of a Parquet file, or remove them (None)."""
     table = pq.read_table(path)
     for name, values in columns.items():
         place = table.schema.get_field_index(name)
@@ -148,7 +148,7 @@ def change_table(path: Path, **columns: object) -> None:
 
 
 def column_of(values: np.ndarray, *, fixed: bool = False) -> pa.Array:
-    """Return [steps, numbers] as LeRobot writes it: scalars where there is one number, lists otherwise."""
+    """Return [steps, numbers] as a column of LeRobot: scalars if there is one number per step, otherwise lists."""
     if values.shape[1] == 1:
         return pa.array(values[:, 0])
     kind = pa.from_numpy_dtype(values.dtype)

@@ -1,4 +1,4 @@
-"""What is a data set that lies nowhere? Episodes made up in memory, which remember how often they were read."""
+"""A data source in memory with synthetic episodes, which records how often they are read."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from vjepa2_ac.errors import InputError
 
 @dataclass
 class MemorySource:
-    """Episodes whose pictures say where they are from: every pixel is (episode, step, camera)."""
+    """Episodes whose images identify their origin: every pixel is (episode, step, camera)."""
 
     lengths: Sequence[int]
     success: Sequence[bool | None] | None = None
     problems: Sequence[EpisodeProblem] = ()
-    unreadable: frozenset[int] = frozenset()  # episodes of which `read` fails
-    pictureless: frozenset[int] = frozenset()  # episodes of which `read_frames` fails
+    unreadable: frozenset[int] = frozenset()  # episodes for which `read` fails
+    pictureless: frozenset[int] = frozenset()  # episodes for which `read_frames` fails
     fault: Callable[[str], InputError] = field(default=lambda where: InputError(where=where, found="damaged"))
     velocities: Callable[[int], np.ndarray | None] = field(default=lambda _: None)
     states: Callable[[int], np.ndarray] | None = None
@@ -44,7 +44,7 @@ class MemorySource:
         return replace(EpisodeTable.from_infos(infos), problems=tuple(self.problems))
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
-        """Return an episode, and remember it."""
+        """Return an episode, and record the read."""
         self.reads.append((index, camera, needed))
         info = self._table[index]
         if index in self.unreadable:

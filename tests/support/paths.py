@@ -1,4 +1,4 @@
-"""Where do tests find the project and the small reference files?"""
+"""Paths of the project and of the small reference files."""
 
 from pathlib import Path
 

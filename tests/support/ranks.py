@@ -21,7 +21,7 @@ def free_port() -> int:
 
 
 class Rank:
-    """A process that is running; as `subprocess.Popen`."""
+    """A process of a run, with the interface of `subprocess.Popen`."""
 
     def __init__(self, words: list[str], environment: dict[str, str]) -> None:
         self.returncode: int | None = None
@@ -49,7 +49,7 @@ class Rank:
             self.send_signal(signal.SIGKILL)
 
     def communicate(self, timeout: float = 120.0) -> tuple[str, str]:
-        """Wait for it; return what it wrote."""
+        """Wait for the process; return its output and error output."""
         until = time.monotonic() + timeout
         while self.poll() is None:
             assert time.monotonic() < until, self.written()
@@ -62,7 +62,7 @@ class Rank:
 
 
 def start_rank(words: list[str], rank: int, processes: int, port: int, **more: str) -> Rank:
-    """Start one process of a run, as srun does; `more` goes into its environment."""
+    """Start one process of a run, as srun does; `more` are additional environment variables."""
     place = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": processes, "LOCAL_WORLD_SIZE": processes}
     environment = {**os.environ, **{name: str(value) for name, value in place.items()}, "OMP_NUM_THREADS": "1"}
     environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), **more}
@@ -70,13 +70,13 @@ def start_rank(words: list[str], rank: int, processes: int, port: int, **more: s
 
 
 def run_ranks(words: list[str], processes: int = 2, status: int = 0, timeout: float = 300.0) -> list[tuple[str, str]]:
-    """Start all processes of a run, and wait for them; return what each wrote."""
+    """Start all processes of a run, and wait for them; return the output and error output of each."""
     port = free_port()
     return finish([start_rank(words, rank, processes, port) for rank in range(processes)], status, timeout)
 
 
 def finish(processes: list, status: int = 0, timeout: float = 120.0) -> list[tuple[str, str]]:
-    """Wait for all; return what each wrote. None is left behind."""
+    """Wait for all processes, and kill them after the timeout; return the output and error output of each."""
     try:
         said = [process.communicate(timeout=timeout) for process in processes]
     finally:
@@ -89,7 +89,7 @@ def finish(processes: list, status: int = 0, timeout: float = 120.0) -> list[tup
 
 
 def wait_until(happened: Callable[[], T], processes: Sequence = (), timeout_s: float = 300.0) -> T:
-    """Wait for something, and return it; none of these processes may end before."""
+    """Wait until `happened` returns a true value, and return the value; no process may exit earlier."""
     until = time.monotonic() + timeout_s
     while not (found := happened()):
         assert all(process.poll() is None for process in processes), finish([*processes])

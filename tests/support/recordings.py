@@ -26,7 +26,7 @@ def write_mp4(
     container: Mapping[str, str] | None = None,
     **options: str,
 ) -> Path:
-    """Write pictures as a video of one key frame in `gop`; `times` (in 1/15360 s) makes the spacing uneven."""
+    """Write images as a video with one key frame every `gop` frames; `times` are frame times in 1/15360 s."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w", options=dict(container or {})) as file:
         stream = file.add_stream(codec, rate=rate)
@@ -65,7 +65,7 @@ def write_raw_droid(
         file["observation/robot_state/cartesian_position"] = states[:, :6]
         file["observation/robot_state/gripper_position"] = states[:, 6]
         file["observation/timestamp/skip_action"] = np.isin(np.arange(len(states)), skipped)
-        file["action/cartesian_position"] = states[:, :6] + 0.01  # commanded, not measured: never to be read
+        file["action/cartesian_position"] = states[:, :6] + 0.01  # commanded, not measured; must never be read
         if joint_velocities is not None:
             file["action/joint_velocity"] = joint_velocities
         for serial, poses in (extrinsics or {}).items():

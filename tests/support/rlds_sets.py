@@ -1,4 +1,4 @@
-"""RLDS sets as other people write them: any features, images in any encoding, and TFDS's two descriptions."""
+"""RLDS data sets as third parties write them: any features, images in any encoding, and TFDS's two descriptions."""
 
 from __future__ import annotations
 

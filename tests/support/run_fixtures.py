@@ -21,7 +21,7 @@ from vjepa2_ac.episode import Progress
 from vjepa2_ac.process import HANG_UP, SIGNALS
 from vjepa2_ac.reporter import SILENT, Reporter
 
-if TYPE_CHECKING:  # the process that only hands out tests does without PyTorch, which takes seconds
+if TYPE_CHECKING:  # the main process of pytest-xdist does not need PyTorch, whose import takes seconds
     import torch
     from accelerate import Accelerator
 
@@ -34,7 +34,7 @@ TINY = {
     "encoder": {"width": 24, "depth": 1, "heads": 2, "mlp_ratio": 2.0},
     "predictor": {"width": 24, "depth": 2, "heads": 2},
 }
-TINY_CONFIG = {  # of a model from scratch
+TINY_CONFIG = {  # `model.sizes` of a model that is trained from scratch
     "image_size": 32,
     "encoder": {"width": 24, "depth": 1, "heads": 2},
     "predictor": TINY["predictor"],
@@ -43,7 +43,7 @@ TINY_CONFIG = {  # of a model from scratch
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Tiny tensors are slower on many threads, and bits depend on their number."""
+    """Use one thread within the context: tiny tensors are slower with more, and results depend on the number."""
     import torch
 
     threads = torch.get_num_threads()
@@ -53,13 +53,13 @@ def one_thread() -> Iterator[None]:
 
 
 class SilentReporter(Reporter):
-    """Keeps what it is told."""
+    """Records all messages and progress."""
 
     def __init__(self) -> None:
         self.tasks: dict[str, list[tuple[int, int]]] = {}
         self.notes: list[str] = []
         self.steps: list[int] = []
-        self.actions: dict[int, Callable[[], object]] = {}  # by the step after which they are done
+        self.actions: dict[int, Callable[[], object]] = {}  # by the step after which they are called
 
     def note(self, text: str) -> None:
         self.notes.append(text)
@@ -80,13 +80,13 @@ class KilledError(Exception):
 
 
 def at_step(reporter: SilentReporter, step: int, action: Callable[[], object]) -> SilentReporter:
-    """Return a reporter that does something when a step is done, before its checkpoint is written."""
+    """Return a reporter that calls a function after a step, before the checkpoint of the step is written."""
     reporter.actions[step] = action
     return reporter
 
 
 def dying_reporter(reporter: SilentReporter, last_step: int) -> SilentReporter:
-    """Return a reporter at whose step the process ends."""
+    """Return a reporter that raises KilledError after a step."""
 
     def die() -> None:
         raise KilledError
@@ -95,7 +95,7 @@ def dying_reporter(reporter: SilentReporter, last_step: int) -> SilentReporter:
 
 
 def signalled_reporter(reporter: SilentReporter, last_step: int, number: int) -> SilentReporter:
-    """Return a reporter at whose step this process gets a signal."""
+    """Return a reporter that sends a signal to this process after a step."""
     return at_step(reporter, last_step, lambda: os.kill(os.getpid(), number))
 
 
@@ -124,7 +124,7 @@ def base_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def default_signals() -> Iterator[None]:
-    """Stop signals end this process and those it starts, also where the tests were started to ignore some: `nohup`."""
+    """Give stop signals their default effect, even if the tests were started with `nohup`, which ignores SIGHUP."""
     before = {number: signal.signal(number, signal.SIG_DFL) for number in (*SIGNALS, HANG_UP)}
     yield
     for number, handler in before.items():
@@ -136,9 +136,9 @@ Popen = Callable[..., "subprocess.Popen[Any]"]
 
 @pytest.fixture
 def popen() -> Iterator[Popen]:
-    """Starts processes that end with the test, and whose pipes are closed then: also where it fails.
+    """A function that starts processes, which are killed after the test, even after a failure.
 
-    Otherwise a later test would be blamed for them, when they are found as garbage.
+    Otherwise the warning about their open pipes would appear in a later test.
     """
     with ExitStack() as ending:
 
@@ -152,7 +152,7 @@ def popen() -> Iterator[Popen]:
 
 @pytest.fixture(scope="session")
 def nursery() -> Nursery:
-    """Starts real processes in no time."""
+    """Starts real processes without importing libraries again."""
     return killable.nursery()
 
 
@@ -200,7 +200,7 @@ def make_config(tmp_path: Path, data_folder: Path, base_folder: Path) -> MakeCon
 
 @pytest.fixture(scope="session")
 def whole_run(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, base_folder: Path) -> Path:
-    """The folder of the run of `make_config()`, which nothing disturbed: one for all tests, to be read only."""
+    """The folder of the run of `make_config()`, trained without interruption. Shared by all tests, read only."""
     from vjepa2_ac.training.loop import train
 
     config = tiny_config(tmp_path_factory.mktemp("whole") / "run", data_folder, base_folder)
@@ -221,7 +221,7 @@ def as_yaml(config: Config) -> str:
 
 @pytest.fixture
 def encoded_frames(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many frames went through the encoder, a number for each chunk."""
+    """The number of frames that were encoded, for each call of the encoder."""
     from vjepa2_ac.model.world_model import WorldModel
 
     counted: list[int] = []

@@ -18,7 +18,7 @@ def trained_weights(run: Path) -> dict[str, torch.Tensor]:
 
 
 def all_weights(run: Path) -> dict[str, torch.Tensor]:
-    """Return what is trained of any kind of run."""
+    """Return all trained weights of a run of any kind."""
     folder = newest_checkpoint(run / "checkpoints") / "adapter"
     files = sorted(folder.rglob("*.safetensors"))
     return {f"{file.name} {name}": value for file in files for name, value in load_file(file).items()}
@@ -29,13 +29,13 @@ def optimizer_state(run: Path) -> dict:
 
 
 def metrics(run: Path) -> list[dict]:
-    """Return all rows of numbers; what warnings advise depends on what a run keeps."""
+    """Return all rows except warnings, without timings. Warnings depend on the files that a run has."""
     rows = [row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] != "warning"]
     return [{k: v for k, v in row.items() if k not in TIMINGS} for row in rows]
 
 
 def numbers_in(state: dict, place: str = "") -> dict[str, torch.Tensor]:
-    """Return all numbers of nested dicts by their places: 8-bit moments are a dict in a dict."""
+    """Return all numbers of nested dicts by their dotted keys; 8-bit moments are nested."""
     inner = [numbers_in(value, f"{place}{key}.") for key, value in state.items() if isinstance(value, dict)]
     own = {f"{place}{key}": torch.as_tensor(value) for key, value in state.items() if not isinstance(value, dict)}
     return {name: value for numbers in (own, *inner) for name, value in numbers.items()}
@@ -54,7 +54,7 @@ def assert_same_run(one: Path, other: Path) -> None:
 
 
 def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
-    """Hold two runs against each other whose sums were made in another order: by another number of processes."""
+    """Compare two runs with different numbers of processes, whose sums have another order."""
     first, second = trained_weights(one), trained_weights(other)
     for name, value in first.items():
         torch.testing.assert_close(second[name], value, rtol=1e-3, atol=1e-6, msg=name)

@@ -14,14 +14,14 @@ import jaxtyping
 def install(modules: list[str], typechecker: str) -> None:
     """Check the calls of functions, and the fields of records, whose annotations have shapes.
 
-    All other functions stay as they are: mypy proves their types, and each check would be much slower than the call.
+    Other functions are not checked: mypy checks their types, and a check would be much slower than the call.
     """
     jaxtyped = jaxtyping.jaxtyped
 
     def decorator(*, typechecker: Callable[..., Any]) -> Callable[..., Any]:
         return lambda thing: jaxtyped(thing, typechecker=typechecker) if has_shapes(thing) else thing
 
-    jaxtyping.jaxtyped = decorator  # what the hook decorates with
+    jaxtyping.jaxtyped = decorator  # the decorator that the import hook uses
     jaxtyping.install_import_hook(modules, typechecker)
 
 

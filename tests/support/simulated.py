@@ -1,4 +1,4 @@
-"""A few short episodes of the simulated arm, for tests that do what a user does."""
+"""A few short episodes of the simulated arm, for tests of examples and guides."""
 
 import shutil
 from pathlib import Path
@@ -19,7 +19,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def clone(simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder to work in, as the root of a clone in which the episodes were recorded before."""
+    """A working directory like the root of a clone, in which the episodes were recorded before."""
     shutil.copytree(simulated, tmp_path / IN_EXAMPLES)
     (tmp_path / "docs").symlink_to(ROOT / "docs")
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""What does a demonstration look like that needs no robot? One smooth trajectory, drawn, as a DroidEpisode."""
+"""Synthetic demonstrations: smooth trajectories with drawn images, as DroidEpisode."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vjepa2_ac.simulation.droid_writer import CAMERAS, DroidEpisode, write_droid
 
 
 def synthetic_states(steps: int, *, seed: int = 0) -> Float[np.ndarray, "steps 7"]:
-    """Return a smooth measured trajectory (legend: episode.py); roll and yaw cross pi (gripper down)."""
+    """Return a smooth measured trajectory (conventions: episode.py); roll and yaw cross pi (gripper down)."""
     generator = np.random.default_rng(seed)
     time = np.arange(steps)[:, None] / 15.0
     speed, phase = generator.uniform(0.5, 1.5, 7), generator.uniform(0, 2 * np.pi, 7)
@@ -21,13 +21,13 @@ def synthetic_states(steps: int, *, seed: int = 0) -> Float[np.ndarray, "steps 7
     reach = np.array([0.15, 0.25, 0.15, 0.3, 0.3, 0.4, 0.5])
     states = centre + reach * np.sin(speed * time + phase)
     states[:, 3:6] = (states[:, 3:6] + np.pi) % (2 * np.pi) - np.pi
-    return states.astype(np.float32).astype(np.float64)  # RLDS keeps float32
+    return states.astype(np.float32).astype(np.float64)  # RLDS stores float32
 
 
 def draw_frame(
     state: Float[np.ndarray, " 7"], *, size: tuple[int, int] = (180, 320), camera: int = 0
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a picture that tells the pose: a disc at the gripper, coloured by closedness, and a bar for yaw."""
+    """Return an image that shows the pose: a disc at the gripper, coloured by closedness, and a bar for the yaw."""
     height, width = size
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
     frame = np.stack(
@@ -46,7 +46,7 @@ def draw_frame(
 def synthetic_episode(
     number: int, *, steps: int = 40, size: tuple[int, int] = (180, 320), success: bool = True
 ) -> DroidEpisode:
-    """Return one drawn demonstration; its identity follows from its number."""
+    """Return a synthetic demonstration whose identity is determined by its number."""
     states = synthetic_states(steps + 1, seed=number)
     measured, target = states[:-1], states[1:]
     joints = np.sin(np.arange(steps)[:, None] / 15.0 + np.arange(7))
@@ -88,9 +88,9 @@ def write_synthetic_droid(
     size: tuple[int, int] = (180, 320),
     first: int = 0,
 ) -> Path:
-    """Write drawn demonstrations as a data set in DROID's schema; every third is a failure. Returns the folder.
+    """Write synthetic demonstrations in DROID's schema, and return the folder; every third demonstration is a failure.
 
-    Those of another data set are counted from another `first`.
+    `first` is the number of the first demonstration; data sets with other numbers have other demonstrations.
     """
     lengths = [steps] * episodes if isinstance(steps, int) else list(steps)
     drawn = (

@@ -54,7 +54,7 @@ def decode_example(data: bytes) -> dict[str, tuple[Kind | None, Sequence[Any] | 
 
 
 def in_any_order(folder: Path, target: Path, seed: int) -> Path:
-    """Write a data set again with the features of every record in a drawn order, as TFDS leaves it to a hash."""
+    """Write a copy of a data set with the features of each record in random order; TFDS orders them by a hash."""
     target.mkdir()
     generator = np.random.default_rng(seed)
     for file in folder.iterdir():

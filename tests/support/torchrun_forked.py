@@ -1,4 +1,4 @@
-"""`torchrun … -m vjepa2_ac.cli …` with workers that are forked: torchrun would start Python anew for each."""
+"""`torchrun … -m vjepa2_ac.cli …` with forked workers, which start faster than new Python processes."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""What do the recordings of a robot look like that has no pose? Any numbers, drawn, as .npz episodes."""
+"""Synthetic recordings of a robot without poses: vectors of numbers, as .npz episodes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FPS = 10.0
 
 
 def vectors(steps: int, width: int, *, seed: int) -> Float[np.ndarray, "steps width"]:
-    """Return smooth numbers of the order of 1, as of joints."""
+    """Return smooth numbers of the order of 1, like joint angles."""
     generator = np.random.default_rng(seed)
     speed, phase = generator.uniform(0.5, 2.0, width), generator.uniform(0, 2 * np.pi, width)
     return np.sin(speed * np.arange(steps)[:, None] / FPS + phase)
@@ -21,7 +21,7 @@ def vectors(steps: int, width: int, *, seed: int) -> Float[np.ndarray, "steps wi
 def draw_vector(
     state: Float[np.ndarray, " width"], size: tuple[int, int] = (36, 48)
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a picture with a bar for each number, as high as it is large."""
+    """Return an image with a bar for each number, whose height shows the number."""
     height, width = size
     frame = np.full((height, width, 3), 40, np.uint8)
     for number, value in enumerate(state):
@@ -34,7 +34,7 @@ def draw_vector(
 def write_vectors(
     folder: Path, *, width: int, action_width: int | None = None, episodes: int = 8, steps: int = 24, **changes: Any
 ) -> Path:
-    """Write drawn episodes of a robot of so many numbers, with commands of another width where asked for."""
+    """Write synthetic episodes with states of `width` numbers, and with actions if `action_width` is given."""
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(episodes):
         states = vectors(steps, width, seed=number)

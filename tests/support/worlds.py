@@ -1,4 +1,4 @@
-"""Worlds small enough to compute by hand, and predictors with known errors."""
+"""A world that can be computed by hand, and predictors with known errors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def moved(latents: Tensor, actions: Tensor) -> Tensor:
 
 
 class Oracle:
-    """Knows the world."""
+    """A predictor without errors."""
 
     def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
         """Return the true next frames, given true ones and true actions."""
@@ -39,29 +39,29 @@ class Oracle:
 
 
 class Copier:
-    """Persistence: the last frame that was seen."""
+    """Persistence: predicts the last input frame."""
 
     def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-        """Return the frames that were given."""
+        """Return the input frames."""
         del actions, states, extrinsics
         return latents
 
     def rollout(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-        """Return the last one, again and again."""
+        """Return the last input frame for each step."""
         del states, extrinsics
         return latents[:, -1:].expand(-1, actions.shape[1], -1, -1)
 
 
 class Halfway(Oracle):
-    """Thinks that an action does half of what it does."""
+    """A predictor that underestimates the effect of actions by half."""
 
     def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-        """Return frames that are half as far."""
+        """Return the next frames with half of the true change."""
         return super().predict(latents, actions / 2, states, extrinsics)
 
 
 def actions_of(clips: int, seed: int = 0, width: int = 7) -> Tensor:
-    """Return actions of a few cm; the rotations are small, too."""
+    """Return actions of a few cm with small rotations."""
     generator = torch.Generator().manual_seed(seed)
     return 0.03 * torch.randn(clips, TIME - 1, width, generator=generator)
 
@@ -96,7 +96,7 @@ def in_batches(batch: LatentBatch, size: int) -> list[LatentBatch]:
 
 
 def again(batch: LatentBatch, size: int = 4, space: ActionSpace = POSE_CHANGE) -> RepeatableClips:
-    """Return clips that can be read again; their pictures are grey."""
+    """Return clips that can be read several times, with grey images."""
     places = {name: place for place, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True))}
 
     def read(names):  # type: ignore[no-untyped-def]
@@ -108,7 +108,7 @@ def again(batch: LatentBatch, size: int = 4, space: ActionSpace = POSE_CHANGE) -
 
 
 def about(**changes: object) -> About:
-    """Return what an evaluation of these clips is called."""
+    """Return the description of an evaluation of these clips."""
     values: dict[str, object] = {
         "subject": "run", "checkpoint": "step-00000002 (the newest)", "checkpoint_path": "step-00000002",
         "source": "rlds", "data": "data", "cameras": ("exterior_1_left",), "split": "test", "frames": TIME, "stride": 4,
