@@ -68,7 +68,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     places = {name: place for place, name in enumerate(LONGEST)}
     for item in items:
         name = os.path.relpath(item.path, ROOT / "tests")
-        if name.startswith(SLOW) or "test_a_real_world" in item.name:
+        if name.startswith(SLOW) or "test_installed_environment_is_solved" in item.name:
             item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: places.get(item.path.name, len(places)))
 

@@ -1,4 +1,4 @@
-"""The order of rooms and the homes of heavy libraries, held by a machine: each test lists every violation at once."""
+"""The layers of the package, and the modules that may import heavy libraries; each test lists all violations."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from paths import ROOT
 
 PACKAGE = Path(vjepa2_ac.__file__).parent
 
-# A room imports only what stands before it; those between two "<" or in one line do not know each other.
-FLOORS = [  # from the ground floor up
+# A package or module imports only lower layers. Names in one line, or between two "<", do not import each other.
+LAYERS = [  # from the lowest layer up
     "__init__ errors episode intervals process",
     "registry reporter spaces storage",
     "config media",
@@ -32,7 +32,7 @@ FLOORS = [  # from the ground floor up
     "api export init explore",
     "cli",
 ]
-WITHIN = """
+LAYERS_WITHIN = """
 data: poses < index < selection files transforms < idle windows < sources < clips < dataset < loader convert
 data.sources: tfrecord parquet latent_files indexed_source < rlds_shards lerobot_meta < rlds_episode < rlds \
     droid_raw lerobot npz latents
@@ -49,12 +49,12 @@ cli: waiting < progress < options tables < train < data < evaluate explore plan 
 simulation: domains droid_writer < motion camera < arm < tasks < rollout < policies < record < benchmark \
     counterfactual < manifest worlds
 """
-ORDERS = {"": FLOORS}
-for line in WITHIN.strip().splitlines():
+ORDERS = {"": LAYERS}
+for line in LAYERS_WITHIN.strip().splitlines():
     room, _, order = line.partition(": ")
     ORDERS[room] = order.split("<")
 
-HOMES = {
+ALLOWED_IMPORTERS = {
     "PIL": ["media/"],
     "accelerate": [
         "distributed.py",
@@ -86,7 +86,7 @@ HOMES = {
     "websockets": ["explore/", "serving/"],
 }  # fmt: skip
 
-MOST_FILES = 16  # in one folder, `__init__` included
+MAX_FILES = 16  # in one folder, `__init__` included
 
 
 @cache
@@ -131,76 +131,76 @@ def own_imports(path: Path) -> set[str]:
     return found
 
 
-def rooms_within(folder: str, module: str) -> str | None:
-    """The room of a folder that a module is in; None: it is not in that folder."""
+def package_within(folder: str, module: str) -> str | None:
+    """The part of a folder, a package or a module, that contains a module; None: the module is not in the folder."""
     if not folder:
         return module.split(".", maxsplit=1)[0]
     return module[len(folder) + 1 :].split(".", maxsplit=1)[0] if module.startswith(folder + ".") else None
 
 
-def test_a_room_imports_only_rooms_that_stand_before_it() -> None:
+def test_package_imports_only_lower_packages() -> None:
     wrong = []
     for folder, order in ORDERS.items():
         rank = {room: place for place, line in enumerate(order) for room in line.split()}
         for module, path in modules().items():
-            room = rooms_within(folder, module)
+            room = package_within(folder, module)
             if room is None:
                 continue
             if room not in rank:
                 wrong.append(f"{module}: not in the order of {folder or 'the package'}")
                 continue
             for other_module in own_imports(path):
-                other = rooms_within(folder, other_module)
+                other = package_within(folder, other_module)
                 if other is not None and other != room and rank.get(other, -1) >= rank[room]:
                     wrong.append(f"{module} imports {other_module}")
     assert not wrong, "\n".join(sorted(wrong))
 
 
-def test_no_folder_imports_itself_by_way_of_another() -> None:
-    """At every level: what lies side by side in a folder forms no circle."""
+def test_imports_between_packages_have_no_cycle() -> None:
+    """At every level, the imports between the parts of a folder form no cycle."""
     for folder in {""} | {name.rpartition(".")[0] for name in modules() if "." in name}:
         arrows: defaultdict[str, set[str]] = defaultdict(set)
         for module, path in modules().items():
-            if room := rooms_within(folder, module):
-                arrows[room] |= {other for one in own_imports(path) if (other := rooms_within(folder, one))} - {room}
+            if room := package_within(folder, module):
+                arrows[room] |= {other for one in own_imports(path) if (other := package_within(folder, one))} - {room}
         TopologicalSorter(arrows).prepare()  # its error names the circle
 
 
-def test_a_folder_is_small_enough_to_be_read_at_a_glance() -> None:
+def test_folders_have_at_most_sixteen_modules() -> None:
     count = defaultdict(int)
     for path in modules().values():
         count[path.parent.relative_to(PACKAGE).as_posix()] += 1
-    assert not {folder: files for folder, files in count.items() if files > MOST_FILES}
+    assert not {folder: files for folder, files in count.items() if files > MAX_FILES}
 
 
-def test_the_drawing_of_the_house_shows_the_order() -> None:
+def test_layer_diagram_in_the_docs_equals_the_layers() -> None:
     notes = (ROOT / "docs/IMPLEMENTATION_NOTES.md").read_text().split("\n## Package layers\n")[1].split("\n## ")[0]
     drawn = re.findall(r"^[ \d]\d  (.{37})", notes, re.MULTILINE)
     assert [set(line.split()) for line in drawn[::-1]] == [set(line.split()) - {"__init__"} for line in ORDERS[""]]
 
 
-def test_heavy_libraries_stay_in_their_homes() -> None:
+def test_heavy_libraries_are_imported_in_allowed_modules_only() -> None:
     wrong = []
     for path in modules().values():
         name = path.relative_to(PACKAGE).as_posix()
         for module in imports_of(path):
-            homes = HOMES.get(module.split(".")[0])
+            homes = ALLOWED_IMPORTERS.get(module.split(".")[0])
             if homes is not None and not any(name.startswith(home) for home in homes):
                 wrong.append(f"{name} imports {module}")
     assert not wrong, "\n".join(sorted(wrong))
 
 
 EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-BROUGHT = {  # the libraries that each extra of the program brings, by name
+LIBRARIES_OF_EXTRAS = {  # the libraries that each extra of the program brings, by name
     extra: {re.split(r"[\[<>=]", one)[0] for one in needed}
     for extra, needed in EXTRAS.items() if extra not in {"data", "dev", "docs"}
 }  # fmt: skip
 
 
-def test_every_module_can_be_imported_without_the_libraries_of_extras() -> None:
+def test_modules_can_be_imported_without_extras() -> None:
     code = (
         "import sys, importlib\n"
-        f"sys.modules.update(dict.fromkeys({sorted(set().union(*BROUGHT.values()))}))\n"
+        f"sys.modules.update(dict.fromkeys({sorted(set().union(*LIBRARIES_OF_EXTRAS.values()))}))\n"
         f"for name in {sorted(set(modules()) - {'__init__', 'cli.__main__'})}:\n"
         "    importlib.import_module(f'vjepa2_ac.{name}')\n"
     )
@@ -208,7 +208,7 @@ def test_every_module_can_be_imported_without_the_libraries_of_extras() -> None:
     assert done.returncode == 0, done.stderr[-600:]
 
 
-def test_the_hint_for_a_library_names_an_extra_that_brings_it() -> None:
+def test_install_hint_names_an_extra_with_the_library() -> None:
     asked, wrong = 0, []
     for module, path in modules().items():
         for node in ast.walk(tree_of(path)):
@@ -217,14 +217,14 @@ def test_the_hint_for_a_library_names_an_extra_that_brings_it() -> None:
                 library = node.args[0].value if isinstance(node.args[0], ast.Constant) else "websockets"  # serve's loop
                 asked += 1
                 if str(library).split(".")[0] not in {
-                    one.replace("-", "_") for one in BROUGHT.get(str(named["extra"]), ())
+                    one.replace("-", "_") for one in LIBRARIES_OF_EXTRAS.get(str(named["extra"]), ())
                 }:
                     wrong.append(f"{module}: {library}: {named['extra']}")
     assert asked > 5
     assert not wrong
 
 
-def test_only_users_take_the_public_names_from_the_package_itself() -> None:
-    """Else the order of rooms would not see what a room imports."""
+def test_modules_do_not_import_the_public_names() -> None:
+    """Otherwise the test of the layers would miss these imports."""
     public = {f"vjepa2_ac.{name}" for name in vjepa2_ac.__all__}
     assert not {module: found for module, path in modules().items() if (found := imports_of(path) & public)}

@@ -24,7 +24,7 @@ BLOCKS = [text for page in OF_DATA for text in re.findall(r"```yaml\n(.*?)```", 
 
 
 @pytest.mark.parametrize("text", BLOCKS, ids=lambda text: text.splitlines()[0])
-def test_every_config_of_the_data_pages_is_complete(text: str) -> None:
+def test_configs_in_the_data_pages_are_valid(text: str) -> None:
     parse_config(yaml.safe_load(text), where="docs/data.md")
 
 
@@ -40,7 +40,7 @@ OURS -= {"src", "demo"}  # the second is made by commands
 FILES = ("json", "md", "npz", "png", "pt", "safetensors", "yaml")
 
 
-def is_there(path: str) -> bool:
+def file_exists(path: str) -> bool:
     """Whether a file is in the project, named from its root, from the package, or from the tests."""
     return any((root / path).exists() for root in (ROOT, PACKAGE, ROOT / "tests"))
 
@@ -57,29 +57,31 @@ def is_module_or_part_of_one(dotted: str) -> bool:
 GROUPS = {one.group for one in REGISTRIES}  # entry points, which look like modules
 
 
-def is_knob(dotted: str) -> bool:
+def is_config_key(dotted: str) -> bool:
     return any(f"{key}.".startswith(f"{dotted}.") for key in all_keys())
 
 
-def test_files_that_are_named_are_there() -> None:
+def test_named_files_exist() -> None:
     """Files of ours: with a folder before them. Those of other projects stand beside their commit."""
     wrong = []
     for path in TODAY:
         text = re.sub(r"Source: .*?(?=\n\s*\n|\"\"\"|\Z)", "", path.read_text(), flags=re.DOTALL)
         named = re.findall(r"(?<![\w./~-])((?:[a-z_]+/)+[A-Za-z_]+\.(?:py|md|yaml|png|sh|txt))\b", text)
         ours = [name for name in named if name.split("/")[0] in OURS]
-        wrong += [f"{path.relative_to(ROOT)}: {name}" for name in ours if not is_there(name)]
+        wrong += [f"{path.relative_to(ROOT)}: {name}" for name in ours if not file_exists(name)]
     assert not wrong, "\n".join(wrong)
 
 
-def test_modules_that_are_named_are_there() -> None:
+def test_named_modules_exist() -> None:
     """`vjepa2_ac.x.y` anywhere; and `x.y` where x is a room, unless that is a knob."""
     wrong = []
     for path in [*TODAY, *PACKAGE.rglob("*.jinja")]:
         text = path.read_text()
         whole = re.findall(r"\bvjepa2_ac\.([a-z_]\w*(?:\.[A-Za-z_]\w*)*)", text)
         within = re.findall(r"`([a-z_]+(?:\.[A-Za-z_]\w*)+)`", text)
-        within = [name for name in within if (PACKAGE / name.split(".", maxsplit=1)[0]).is_dir() and not is_knob(name)]
+        within = [
+            name for name in within if (PACKAGE / name.split(".", maxsplit=1)[0]).is_dir() and not is_config_key(name)
+        ]
         named = [name for name in whole + within if not name.endswith(FILES) and f"vjepa2_ac.{name}" not in GROUPS]
         wrong += [f"{path.relative_to(ROOT)}: {name}" for name in named if not is_module_or_part_of_one(name)]
     assert not wrong, "\n".join(wrong)
@@ -90,18 +92,18 @@ SECTIONS = (
 )  # fmt: skip
 
 
-def test_knobs_that_are_named_are_there() -> None:
+def test_named_config_keys_exist() -> None:
     wrong = []
     for path in [path for path in DOCS if path.name not in ("decisions.md", "IMPLEMENTATION_NOTES.md")]:
         named = re.findall(rf"`((?:{'|'.join(SECTIONS)})\.[a-z_]+(?:\.[a-z_]+)*)(?:[:=][^`]*)?`", path.read_text())
         wrong += [
             f"{path.name}: {name}" for name in named
-            if not name.endswith(FILES) and not is_knob(name) and not is_module_or_part_of_one(name)
+            if not name.endswith(FILES) and not is_config_key(name) and not is_module_or_part_of_one(name)
         ]  # fmt: skip
     assert not wrong, "\n".join(wrong)
 
 
-def test_no_text_installs_the_bare_name() -> None:
+def test_no_text_installs_the_package_by_name_alone() -> None:
     """Whoever registers the name on an index could run code on the machine of every reader."""
     names = [*ROOT.glob("*.md"), *(path for folder in TEXTS for path in (ROOT / folder).rglob("*"))]
     texts = {path: path.read_text() for path in names if path.suffix in SUFFIXES}
@@ -116,7 +118,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").g
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_the_program_accepts_every_command_of_a_guide(page, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_of_guides_are_accepted(page, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     for line in commands_of(page.read_text()):
         for command in re.split(r"&&|;|\|", line.partition(" > ")[0]):
@@ -150,7 +152,9 @@ class Robot:
         self.targets.append(target)
 
 
-def test_the_robots_loop_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_robot_loop_of_the_planning_page_runs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     (loop,) = re.findall(r"```python\n(.*?)```", PLANNING, flags=re.DOTALL)
     robot = Robot()
     monkeypatch.chdir(ROOT)
@@ -163,7 +167,7 @@ def test_the_robots_loop_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert capsys.readouterr().out.splitlines()[-1].startswith("at the goal")
 
 
-def test_the_command_runs_and_writes_what_the_page_lists(
+def test_plan_command_writes_the_documented_keys(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shown = PLANNING.split("```sh\n")[1].split("```")[0].replace("\\\n", " ")

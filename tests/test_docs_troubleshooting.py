@@ -40,7 +40,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("command", "message"), SHOWN, ids=[command for command, _ in SHOWN])
-def test_the_page_shows_what_is_printed(
+def test_troubleshooting_page_shows_the_printed_errors(
     command: str, message: str, place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if any(command.startswith(start) for start in NOT_MADE):
@@ -53,6 +53,6 @@ def test_the_page_shows_what_is_printed(
     assert re.search(expected, printed), printed
 
 
-def test_there_are_ten() -> None:
+def test_troubleshooting_page_has_ten_sections() -> None:
     assert re.findall(r"^## (\d+)\.", PAGE, flags=re.MULTILINE) == [str(number) for number in range(1, 11)]
     assert all(any(command.startswith(start) for command, _ in SHOWN) for start in NOT_MADE)

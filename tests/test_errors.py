@@ -92,7 +92,7 @@ def test_install_command_fits_the_installation(
     assert pip_install(extra) == f"{sys.executable} -m {command}"
 
 
-def test_a_printed_command_quotes_what_a_shell_would_split(tmp_path: Path) -> None:
+def test_printed_command_quotes_special_characters(tmp_path: Path) -> None:
     assert shell_command("evaluate", "runs/own") == "vjepa2-ac evaluate runs/own"
     odd = tmp_path / "e ü#50% [a]=b;'$(x)"
     words = ["vjepa2-ac", "train", str(odd), "--resume", f"run_dir={odd}"]

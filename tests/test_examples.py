@@ -1,4 +1,4 @@
-"""Each example runs on a fresh clone, says what a person wants to know, and tells wrong input without a traceback."""
+"""Each example runs on a fresh clone, prints its results, and reports wrong input without a traceback."""
 
 import re
 import runpy
@@ -22,13 +22,13 @@ def main_of(name: str) -> Callable[..., None]:
     return main
 
 
-def test_the_page_names_all_scripts() -> None:
+def test_python_page_names_all_example_scripts() -> None:
     page = (ROOT / "docs/python.md").read_text()
     assert {path.stem for path in EXAMPLES} == {"look_at_data", "predict", "finetune", "train_loop", "plan_in_a_loop"}
     assert all(f"python examples/{path.name}" in page for path in EXAMPLES)
 
 
-def test_a_first_look_at_data_records_them_and_draws_a_sheet(
+def test_look_at_data_records_episodes_once_and_draws_a_sheet(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -54,7 +54,7 @@ def test_a_first_look_at_data_records_them_and_draws_a_sheet(
 
 
 @pytest.mark.usefixtures("clone")
-def test_predictions_are_better_than_persistence(capsys: pytest.CaptureFixture[str]) -> None:
+def test_predict_example_is_better_than_persistence(capsys: pytest.CaptureFixture[str]) -> None:
     main_of("predict")()
     ratios = [
         float(found) for found in re.findall(r"s ahead.* (\d\.\d+)$", capsys.readouterr().out, flags=re.MULTILINE)
@@ -64,14 +64,14 @@ def test_predictions_are_better_than_persistence(capsys: pytest.CaptureFixture[s
 
 
 @pytest.mark.usefixtures("clone")
-def test_fine_tuning_trains_measures_and_loads(capsys: pytest.CaptureFixture[str]) -> None:
+def test_finetune_example_trains_evaluates_and_loads(capsys: pytest.CaptureFixture[str]) -> None:
     main_of("finetune")(str(IN_EXAMPLES), *QUICK)
     printed = capsys.readouterr().out
     for words in ("step 2: loss", "Validation at step 2", "base", "adapter", "report.html", "step-0000000"):
         assert words in printed, words
 
 
-def test_the_loop_comes_nearer_to_the_goal(
+def test_plan_in_a_loop_example_approaches_the_goal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -94,7 +94,7 @@ WRONG = {
 
 @pytest.mark.usefixtures("clone")
 @pytest.mark.parametrize("name", WRONG)
-def test_wrong_input_is_one_clear_message(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_input_of_an_example_exits_with_one_error(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments, words = WRONG[name]
     path = str(ROOT / "examples" / f"{name}.py")
     monkeypatch.setattr(sys, "argv", [path, *arguments])

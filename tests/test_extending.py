@@ -1,4 +1,4 @@
-"""Every recipe of docs/extending.md as a stranger uses it: a module outside the package, YAML, and the commands."""
+"""The recipes of docs/extending.md work in a module outside of the package, with YAML and the commands."""
 
 import json
 import subprocess
@@ -40,7 +40,7 @@ def command(*words: str) -> subprocess.CompletedProcess[str]:
     return nursery().run("-m", "vjepa2_ac.cli", *words, folder=Path.cwd().parent)
 
 
-def test_training_loads_the_core_only() -> None:
+def test_training_imports_core_packages_only() -> None:
     code = "import sys, vjepa2_ac.training.loop; print(*(name for name in sys.modules if name.startswith('vjepa2_ac')))"
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == "", "libraries say nothing when they are imported"
@@ -51,7 +51,7 @@ def test_training_loads_the_core_only() -> None:
     assert not rooms & set(beside.split())
 
 
-def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, make_config) -> None:
+def test_plugin_loss_planner_and_energy_work_from_yaml(at_home: Path, make_config) -> None:
     values = yaml.safe_load(as_yaml(make_config(training__steps=1, run_dir=at_home / "run")))
     values["plugins"] = ["my_module"]
     values["training"] |= {"loss": {"name": "log_cosh", "options": {"scale": 2.0}}}
@@ -82,7 +82,7 @@ def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, m
     assert "--plugin my_module" in refused.stderr
 
 
-def test_options_and_names_are_checked_when_the_config_is_read(at_home: Path, make_config) -> None:
+def test_plugin_options_and_names_are_validated_with_the_config(at_home: Path, make_config) -> None:
     (at_home / "own.yaml").write_text(as_yaml(make_config()))
     wrong = (
         ("training.loss=log_cosch", "Did you mean log_cosh?"),
@@ -100,7 +100,7 @@ def test_options_and_names_are_checked_when_the_config_is_read(at_home: Path, ma
 
 
 @pytest.mark.usefixtures("at_home")
-def test_the_schema_has_what_a_plug_in_brings() -> None:
+def test_config_schema_contains_plugin_options() -> None:
     schema = json.loads(command("config", "schema", "--plugin", "my_module").stdout)
     training = schema["$defs"]["TrainingConfig"]["properties"]
     names, *with_options = training["loss"]["anyOf"]
@@ -116,7 +116,7 @@ def installed(at_home: Path, entry_points: str, code: str, *words: str) -> subpr
     return nursery().run(str(program), *words, folder=at_home.parent)
 
 
-def test_an_installed_package_is_known_without_being_named(at_home: Path, make_config) -> None:
+def test_installed_plugin_is_found_by_its_entry_point(at_home: Path, make_config) -> None:
     (at_home / "own.yaml").write_text(as_yaml(make_config()))
     words = ["config", "show", "own.yaml", "training.loss=log_cosh", "training.loss.options={scale: 3}"]
     done = installed(at_home, "[vjepa2_ac.losses]\nlog_cosh = my_package:LogCosh\n", recipes("A loss"), *words)
@@ -124,7 +124,7 @@ def test_an_installed_package_is_known_without_being_named(at_home: Path, make_c
     assert yaml.safe_load(done.stdout)["training"]["loss"]["options"] == {"scale": 3}
 
 
-def test_a_form_of_data_is_found_trained_on_and_measured_by_a_metric(at_home: Path, base_folder: Path) -> None:
+def test_plugin_data_source_is_recognized_trained_and_evaluated(at_home: Path, base_folder: Path) -> None:
     data = at_home / "walls"
     data.mkdir()
     for number in range(6):

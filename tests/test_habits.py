@@ -1,4 +1,4 @@
-"""The habits of the project: one version, pins, notices, hooks, workflows and links that say what is there."""
+"""Consistency of the project files: version, pins, notices, make targets and workflows."""
 
 import re
 import tomllib
@@ -32,7 +32,7 @@ def loaded(path: Path) -> Any:
 # Version and pins.
 
 
-def test_one_version_and_those_who_repeat_it_agree() -> None:
+def test_version_numbers_agree() -> None:
     cited = loaded(ROOT / "CITATION.cff")["version"]
     newest = re.search(r"^## \[([\d.]+)\] - ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
     assert newest
@@ -40,7 +40,7 @@ def test_one_version_and_those_who_repeat_it_agree() -> None:
     assert '__version__ = version("vjepa2-ac")' in (ROOT / "src/vjepa2_ac/__init__.py").read_text()
 
 
-def test_every_dependency_has_one_pin() -> None:
+def test_every_dependency_has_exactly_one_pin() -> None:
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and line[0] != "#"]
     pins = [canonical(line.split("==")[0]) for line in lines]
     assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in lines)
@@ -53,7 +53,7 @@ def test_every_dependency_has_one_pin() -> None:
 # Notices.
 
 
-def test_everything_that_is_ported_stands_in_the_notice() -> None:
+def test_ported_sources_are_in_the_notice() -> None:
     notice, wrong = (ROOT / "NOTICE").read_text(), []
     for path in sorted((ROOT / "src").rglob("*.py")):
         for block in SOURCE.findall(path.read_text()):
@@ -67,7 +67,7 @@ def test_everything_that_is_ported_stands_in_the_notice() -> None:
 # Pages, forms, workflows, hooks.
 
 
-def test_every_target_that_is_named_is_there() -> None:
+def test_named_make_targets_exist() -> None:
     pages = [ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", ROOT / "docs/releasing.md", *WORKFLOWS]
     for page in pages:
         lines = re.findall(r"(?:^|`|run: )make ([a-z][a-z -]*)", page.read_text(), flags=re.MULTILINE)
@@ -75,7 +75,7 @@ def test_every_target_that_is_named_is_there() -> None:
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
-def test_a_workflow_may_only_read_and_pins_its_actions(path: Path) -> None:
+def test_workflows_are_read_only_and_pin_their_actions(path: Path) -> None:
     text = path.read_text()
     if path.name in {"ci.yml", "weekly.yml"}:
         assert loaded(path)["permissions"] == {"contents": "read"}

@@ -1,4 +1,4 @@
-"""docs/QUICKSTART.md, walked through line by line: what runs here runs, the rest is what the program takes."""
+"""The commands of docs/QUICKSTART.md run in their order; commands that need a robot or a download are only parsed."""
 
 import re
 import shlex
@@ -23,12 +23,12 @@ def commands_of(section: int) -> list[list[str]]:
     return [shlex.split(line) for line in guides.commands_of(SECTIONS[section])]
 
 
-def test_the_page_has_its_sections() -> None:
+def test_quickstart_has_its_sections() -> None:
     assert list(SECTIONS) == [1, 2, 3, 4, 5, 6]
     assert all(words[0] == "vjepa2-ac" for section in (*HERE, 5) for words in commands_of(section))
 
 
-def test_from_data_to_a_number_and_a_plan(
+def test_quickstart_commands_run_from_data_to_plan(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -46,7 +46,7 @@ def test_from_data_to_a_number_and_a_plan(
         assert (tmp_path / made).exists(), made
 
 
-def test_extras_that_are_named_are_there() -> None:
+def test_extras_named_in_quickstart_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     asked = [name for found in re.findall(r"\[([\w,]+)\]\"", SECTIONS[1]) for name in found.split(",")]
     assert asked

@@ -58,14 +58,14 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
 # Each name is registered once, whichever way.
 
 
-def test_a_name_of_this_package_cannot_be_registered_by_a_plugin(write: Write) -> None:
+def test_plugin_cannot_register_a_builtin_name(write: Write) -> None:
     write("p_same", REGISTERS.format(name="l1", function="zero"))
     with pytest.raises(InputError, match=r"'p_same' cannot.*'l1': already registered by vjepa2_ac\.model\.distances"):
         import_plugins(["p_same"], where="own.yaml: plugins")
     assert LOSSES.find("l1").__module__ == "vjepa2_ac.model.distances"
 
 
-def test_a_name_of_one_plugin_cannot_be_registered_by_another_nor_twice_in_one(write: Write) -> None:
+def test_plugins_cannot_register_a_name_twice(write: Write) -> None:
     import_plugins([write("p_first")], where="plugins")
     write("p_second", REGISTERS.format(name="p_first", function="p_first"))
     write("p_twice", REGISTERS.format(name="p_one", function="f") + REGISTERS.format(name="p_one", function="g"))
@@ -81,7 +81,7 @@ def site(tmp_path: Path) -> Path:
     return tmp_path / "site"
 
 
-def test_an_entry_point_cannot_have_a_name_of_this_package_or_of_another(site: Path) -> None:
+def test_entry_points_with_duplicate_names_raise(site: Path) -> None:
     leave_package(site, "p_a", "[vjepa2_ac.losses]\nl1 = p_a:thing\np_new = p_a:thing\n")
     leave_package(site, "p_b", "[vjepa2_ac.losses]\np_new = p_b:thing\n")
     for name, owners in (("l1", r"vjepa2_ac\.model\.distances and by p_a"), ("p_new", "p_a and by p_b")):
@@ -89,7 +89,7 @@ def test_an_entry_point_cannot_have_a_name_of_this_package_or_of_another(site: P
             parse_config({**VALUES, "training": {"loss": name}}, where="own.yaml")
 
 
-def test_a_source_of_this_package_cannot_be_defined_again(site: Path) -> None:
+def test_builtin_source_cannot_be_defined_again(site: Path) -> None:
     with pytest.raises(InputError, match=r"data format 'npz': already registered by vjepa2_ac\.config\.sources"):
 
         class Again(DataConfig):
@@ -152,7 +152,7 @@ PWNED = "open('PWNED', 'w')\n" + REGISTERS.format(name="p_evil", function="f")
 
 
 @pytest.mark.usefixtures("_started")
-def test_the_config_of_a_run_never_imports_from_the_working_directory(write: Write) -> None:
+def test_run_config_never_imports_from_the_working_directory(write: Write) -> None:
     write("p_evil", PWNED)
     leave_package(Path(), "p_dist", "[vjepa2_ac.losses]\np_dist = p_dist:thing\n", PWNED)
     Path("run").mkdir()
@@ -171,7 +171,7 @@ def test_the_config_of_a_run_never_imports_from_the_working_directory(write: Wri
     assert not Path("PWNED").exists()
 
 
-def test_an_installed_module_is_not_shadowed_by_one_in_the_working_directory(write: Write, site: Path) -> None:
+def test_working_directory_does_not_shadow_installed_module(write: Write, site: Path) -> None:
     sys.path.insert(0, "")
     write("p_shadowed", PWNED)
     write("p_entry", PWNED)
@@ -184,7 +184,7 @@ def test_an_installed_module_is_not_shadowed_by_one_in_the_working_directory(wri
     assert sys.path[0] == ""
 
 
-def test_an_installed_module_that_is_no_plugin_is_not_imported_for_a_run(write: Write, site: Path) -> None:
+def test_installed_module_without_plugin_is_not_imported_for_a_run(write: Write, site: Path) -> None:
     leave_package(site, "p_other", "", "open('PWNED', 'w')")
     _ = write
     for module in ("p_other", "antigravity"):
@@ -196,7 +196,7 @@ def test_an_installed_module_that_is_no_plugin_is_not_imported_for_a_run(write: 
 
 
 @pytest.mark.parametrize("door", [load_config, lambda path: load_planning_config("builtin:sim-tiny", config=path)])
-def test_the_users_own_config_imports_from_the_working_directory(write: Write, door: Callable[[Path], object]) -> None:
+def test_user_config_imports_from_the_working_directory(write: Write, door: Callable[[Path], object]) -> None:
     config = Path("mine.yaml")
     write("p_mine")
     config.write_text(as_yaml(parse_config(VALUES, where="")).replace("plugins: []", "plugins: [p_mine]"))

@@ -24,7 +24,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "html"
 
 
-def test_the_pages_ask_nobody_for_anything_and_search_works_from_a_file(site: Path, tmp_path: Path) -> None:
+def test_pages_send_no_requests_and_search_works_from_a_file(site: Path, tmp_path: Path) -> None:
     page = tmp_path / "search.html"
     page.write_text(f'<meta http-equiv="refresh" content="0; url={(site / "search.html").as_uri()}?q=warmup">')
     seen = open_page(page, tmp_path)
@@ -33,13 +33,13 @@ def test_the_pages_ask_nobody_for_anything_and_search_works_from_a_file(site: Pa
     assert (site / "made/api.html").read_text().count('<dt class="sig') > 11
 
 
-def test_every_command_is_on_its_page_as_help_prints_it() -> None:
+def test_commands_page_shows_the_help_of_every_command() -> None:
     page = commands_page()
     for words in ("train", "init", "demo", "data check", "data calibrate", "simulate", "serve", "config"):
         assert f"## {words}\n\n```text\nexample:\n  vjepa2-ac {words} " in page, words
 
 
-def test_every_key_is_on_its_page_with_its_range() -> None:
+def test_config_keys_page_lists_every_key_with_its_range() -> None:
     page = keys_page()
     sections = {key.rpartition(".")[0] for key in all_keys()}
     keys = {re.sub(r"^replay\.data\.", "data.", key) for key in all_keys() if key not in sections | {"replay.data"}}
@@ -60,5 +60,5 @@ def test_every_key_is_on_its_page_with_its_range() -> None:
         ("[![a badge](https://x.org/y.svg)](LICENSE)\nb", "b"),
     ],
 )
-def test_links_lead_to_pages(text: str, expected: str) -> None:
+def test_repository_links_become_links_to_pages(text: str, expected: str) -> None:
     assert on_site(text, "README.md", "index.md") == expected

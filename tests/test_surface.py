@@ -1,4 +1,4 @@
-"""What users type and write is listed in one file: a command, an option or a config section is added on purpose.
+"""Public names, commands, options and config sections equal a golden file, so that each change is intentional.
 
 After a wanted change: `python tests/test_surface.py > tests/golden/surface.txt`, and a line in CHANGELOG.md.
 """
@@ -57,7 +57,7 @@ def printed(what: str) -> str:
     return subprocess.run(words, env=environment, capture_output=True, text=True, check=True).stdout
 
 
-def test_commands_options_names_and_sections_are_those_on_record() -> None:
+def test_surface_equals_the_golden_file() -> None:
     assert printed("surface") == (ROOT / "tests/golden/surface.txt").read_text()
 
 

@@ -1,4 +1,4 @@
-"""The wheel: built as docs/releasing.md says, whole, and enough on its own outside of the checkout."""
+"""The wheel, built as described in docs/releasing.md, is complete and works outside of the checkout."""
 
 import json
 import os
@@ -51,7 +51,7 @@ def run(*words: object, at: Path, path: Path | None = None) -> str:
     return done.stdout
 
 
-def test_it_has_every_file_of_the_package_and_no_other(wheel: Path) -> None:
+def test_wheel_has_exactly_the_files_of_the_package(wheel: Path) -> None:
     package = ROOT / "src/vjepa2_ac"
     inside = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     files = [Path(folder) / name for folder, _, names in os.walk(package, followlinks=True) for name in names]
@@ -74,7 +74,7 @@ print(json.dumps(printed))
 """
 
 
-def test_it_is_enough_outside_of_the_checkout(installed: Path, tmp_path: Path) -> None:
+def test_installed_wheel_works_outside_of_the_checkout(installed: Path, tmp_path: Path) -> None:
     write_npz(tmp_path / "own", range(8))
     commands = (
         "init own --model builtin:sim-tiny --out own.yaml", "config list", "data converter ros2_bag",

@@ -1,4 +1,4 @@
-"""What happens under other actions: from what was recorded, plain physics; and it stands beside what was imagined."""
+"""Simulated outcomes of other actions: they start at the recorded state, and are shown next to predicted frames."""
 
 import json
 import re

@@ -21,7 +21,7 @@ from vjepa2_ac.spaces import matrices_from_euler
 RECIPE = MotionRecipe()
 
 
-def test_the_flange_stays_in_the_box_and_the_joints_within_their_limits() -> None:
+def test_random_reaching_stays_in_the_box_and_joint_limits() -> None:
     motion = random_reaching(DOMAIN_A, 81, np.random.default_rng(0))
     positions = motion.commanded_poses[:, :3]
     assert (positions > np.array(RECIPE.low_m) - 1e-4).all()
@@ -32,7 +32,7 @@ def test_the_flange_stays_in_the_box_and_the_joints_within_their_limits() -> Non
     np.testing.assert_allclose(downward, -1.0, atol=1e-6)
 
 
-def test_measurements_lag_behind_the_commands() -> None:
+def test_measured_poses_lag_behind_commanded_poses() -> None:
     motion = random_reaching(DOMAIN_A, 61, np.random.default_rng(1))
     commanded, measured = motion.commanded_poses[:, :3], motion.poses[:, :3]
     same_time = np.linalg.norm(measured - commanded, axis=1).mean()

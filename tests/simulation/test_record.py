@@ -1,4 +1,4 @@
-"""Recordings read back as DROID, agree with the kinematics, move their block, and say how they can be made again."""
+"""Recordings are read as DROID data, agree with the kinematics, move the block, and can be simulated again."""
 
 import json
 from dataclasses import replace
@@ -51,7 +51,7 @@ def test_recorded_data_set_is_read_by_the_loader(recorded: Path) -> None:
         assert info.success is ("/success/" in made.file_path)
 
 
-def test_the_same_seed_gives_the_same_bytes_in_any_number_of_processes(
+def test_same_seed_gives_same_bytes_with_any_number_of_workers(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

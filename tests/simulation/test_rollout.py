@@ -100,7 +100,7 @@ def test_moving_objects_have_equal_start_positions_in_every_episode(task: TaskNa
         assert (first.frames[1] != first.frames[2]).any(), "nothing moves"
 
 
-def test_an_episode_starts_at_the_start_and_shows_the_goal(arm: SimulatedArm) -> None:
+def test_episode_starts_at_the_start_pose_and_has_the_goal_image(arm: SimulatedArm) -> None:
     trial, policy = trial_of(1, steps=2), Scripted(way(0.05), way(0.0, 0.05))
     result = run_trial(ArmEnvironment(arm), policy, trial, keep_frames=True)
     moved = actions_from_states(np.stack([trial.problem.start, result.states[0]]))  # -pi and pi are one angle

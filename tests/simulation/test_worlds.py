@@ -1,4 +1,4 @@
-"""Worlds that others made are driven, recorded; whatever a program does wrong is one error, and no process is left."""
+"""Third-party environments are run and recorded; a faulty program gives one error, and no process is left."""
 
 import base64
 import json
