@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from made_pages import _leaves
+from made_pages import _find_commands
 from vjepa2_ac.cli import main, program, setup
 from vjepa2_ac.cli.options import parse_arguments
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
@@ -40,7 +40,7 @@ def test_invalid_number_raises_with_the_valid_range(
         assert re.search(rf"error: argument {option}.*: {re.escape(repr(text))} is not {needed}$", last_line(capsys))
 
 
-COMMANDS = dict(_leaves(program._make_parser(), ()))  # by the words of each command
+COMMANDS = dict(_find_commands(program._make_parser(), ()))  # by the words of each command
 
 
 def example_arguments(words: tuple[str, ...]) -> list[str]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from made_pages import _leaves
+from made_pages import _find_commands
 from vjepa2_ac.cli.options import as_config, as_local, as_model, as_path, as_path_or_url
 from vjepa2_ac.cli.program import _make_parser, main
 from vjepa2_ac.config import DiskCacheConfig
@@ -81,7 +81,7 @@ def test_cache_environment_variable_is_resolved_like_a_path_key(monkeypatch: pyt
 def test_all_path_options_use_the_same_resolution() -> None:
     path_words = {"CONFIG", "FOLDER", "DIR", "PATH", "PNG", "IMAGE", "RUN", "MODEL", "RUN_OR_MODEL"}
     num_path_options = 0
-    actions = ((words, action) for words, parser in _leaves(_make_parser(), ()) for action in parser._actions)
+    actions = ((words, action) for words, parser in _find_commands(_make_parser(), ()) for action in parser._actions)
     for command, action in actions:
         is_path = path_words & set(str(action.metavar).replace("|", " ").split())
         if is_path and action.dest != "overrides":
