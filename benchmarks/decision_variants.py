@@ -12,7 +12,7 @@ from vjepa2_ac.planning.planner import Plan
 
 PLAIN, OFFICIAL, COMPILED, ADAPTER = "plain", "official", "+compiled", "+adapter"
 _OURS = "ours/"
-_ACTION_TOLERANCE = 1e-5  # metres, radians, closedness
+_ACTION_TOLERANCE = 1e-5  # metres, radians, gripper position
 _ENERGY_TOLERANCE = 1e-4  # relative to the largest energy
 
 

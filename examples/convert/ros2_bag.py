@@ -161,8 +161,8 @@ def read_measurements(
 def compute_closedness(numbers: np.ndarray, names: list[str], where: str, options: argparse.Namespace) -> np.ndarray:
     """Return 0 (open) to 1 (closed) for the numbers of a gripper, [steps, joints], which are added."""
     total, span = numbers.sum(axis=1), options.gripper_closed - options.gripper_open
-    closedness = (total - options.gripper_open) / span
-    is_in_range = closedness.min() >= -0.1 and closedness.max() <= 1.1
+    gripper_position = (total - options.gripper_open) / span
+    is_in_range = gripper_position.min() >= -0.1 and gripper_position.max() <= 1.1
     moving = numbers[:, np.ptp(numbers, axis=0) > 0.05 * abs(span)].T
     is_gripper = len(moving) < 2 or (len(moving) == 2 and np.corrcoef(moving)[0, 1] > 0.9)  # two fingers move together
     if "[" not in options.gripper and not (is_gripper and (is_in_range or numbers.shape[1] <= 2)):
@@ -174,7 +174,7 @@ def compute_closedness(numbers: np.ndarray, names: list[str], where: str, option
     if not is_in_range:
         ends = f"{total.min():.4g} to {total.max():.4g}"
         raise SystemExit(f"{where} goes from {ends}: set --gripper-open and --gripper-closed")
-    return np.asarray(closedness.clip(0, 1))
+    return np.asarray(gripper_position.clip(0, 1))
 
 
 def find_newest(times: np.ndarray, steps: np.ndarray, where: str) -> np.ndarray:
@@ -209,8 +209,8 @@ def make_episode(bag: Path, cameras: dict[str, str], options: argparse.Namespace
         for (name, topic), at_steps in zip(cameras.items(), indices, strict=False):
             images = read_values(reader, topic, bag, at_steps.tolist())
             arrays[name] = np.stack([decode_image(image, options.height, f"{bag}: {topic}") for image, _ in images])
-    closedness = compute_closedness(fingers[indices[-1]], names, f"{bag}: {options.gripper}", options)
-    arrays["states"] = np.concatenate([poses[indices[-2]], closedness[:, None]], axis=1)
+    gripper_position = compute_closedness(fingers[indices[-1]], names, f"{bag}: {options.gripper}", options)
+    arrays["states"] = np.concatenate([poses[indices[-2]], gripper_position[:, None]], axis=1)
     return arrays | ({"language": options.language} if options.language else {})
 
 

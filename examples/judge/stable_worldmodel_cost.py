@@ -3,7 +3,8 @@
     from stable_worldmodel.solver import CEMSolver
     solver = CEMSolver(WorldModelCost(Controller.of_run(load_run("demo/run"))), num_samples=64)
 
-Actions are changes per model step in metres, radians and closedness (`vjepa2_ac.episode`); they are not normalised.
+Actions are changes per model step in metres, radians and gripper position (`vjepa2_ac.episode`); they are not
+normalised.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ def drive(env: Any, policy: Any, camera: str, goal: str, steps: int = 30) -> Non
     """Move the arm to a goal that is stored on the server, one model step at a time."""
     for step in range(steps):
         reply = policy.infer(make_request(env.get_observation(), camera) | {"prompt": goal, "reset": step == 0})
-        target = np.asarray(reply["actions"][-1])  # x, y, z, roll, pitch, yaw, closedness, as in DROID
+        target = np.asarray(reply["actions"][-1])  # x, y, z, roll, pitch, yaw, gripper position, as in DROID
         print(f"{step}: {reply['why']}, energy {reply['energy']['now']}, to {target[:3].round(3)}")
         if reply["done"]:
             break

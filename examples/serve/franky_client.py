@@ -27,13 +27,15 @@ def drive(robot: Any, gripper: Any, policy: Any, camera: Callable[[], np.ndarray
     for step in range(steps):
         tool = robot.state.F_T_EE  # the server plans for the flange, franky moves the tool
         reply = policy.infer(observe(camera(), robot.state.O_T_EE * tool.inverse, gripper) | goal_request(goal, step))
-        x, y, z, *angles, closedness = reply["actions"][-1]  # the target, within the server's limits and workspace
+        x, y, z, *angles, gripper_position = reply["actions"][
+            -1
+        ]  # the target, within the server's limits and workspace
         print(f"{step}: {reply['why']}, energy {reply['energy']['now']}, to {x:.3f} {y:.3f} {z:.3f}")
         if reply["done"]:
             break
         flange = Affine([x, y, z], Rotation.from_euler("xyz", angles).as_quat())
         robot.move(CartesianMotion(flange * tool))  # returns when the arm has reached the pose
-        grip(gripper, closedness)
+        grip(gripper, gripper_position)
 
 
 def observe(image: np.ndarray, flange: Any, gripper: Any) -> dict[str, Any]:
@@ -53,13 +55,13 @@ def goal_request(goal: str, step: int) -> dict[str, Any]:
     return {"prompt": goal, "reset": step == 0}
 
 
-def grip(gripper: Any, closedness: float) -> None:
+def grip(gripper: Any, gripper_position: float) -> None:
     """Grasp, open, or leave the fingers unchanged if the change is small."""
-    change = closedness - np.clip(1.0 - gripper.width / gripper.max_width, 0.0, 1.0)
+    change = gripper_position - np.clip(1.0 - gripper.width / gripper.max_width, 0.0, 1.0)
     if change > 0.05:
         gripper.grasp(0.0, SPEED_M_S, FORCE_N, epsilon_outer=1.0)
     elif change < -0.05:
-        gripper.move((1.0 - closedness) * gripper.max_width, SPEED_M_S)
+        gripper.move((1.0 - gripper_position) * gripper.max_width, SPEED_M_S)
 
 
 def main(arm: str, server: str, key: str, goal: str) -> None:

@@ -4,7 +4,7 @@
     vjepa2-ac simulate RUN --world "worlds/libero/bin/python examples/worlds/libero.py libero_object --task butter"
 
 State and targets: the pose of the grip site in the frame of the robot's base (metres, extrinsic xyz Euler angles in
-radians), and the closedness of the gripper from 0 (open) to 1. A seed below 50 selects one of the benchmark's fixed
+radians), and the gripper position from 0 (open) to 1. A seed below 50 selects one of the benchmark's fixed
 initial states; a larger seed draws a random state. An unknown suite prints the names of all suites.
 """
 
@@ -49,8 +49,8 @@ class World:
         site = self.robot.eef_site_id
         turn = Rotation.from_matrix(self.sim.data.site_xmat[site].reshape(3, 3)).as_euler("xyz")
         fingers = self.sim.data.qpos[self.robot._ref_gripper_joint_pos_indexes]
-        closedness = np.clip(1.0 - np.abs(fingers).mean() / 0.04, 0.0, 1.0)
-        return np.concatenate([self.sim.data.site_xpos[site] - self.base(), turn, [closedness]])
+        gripper_position = np.clip(1.0 - np.abs(fingers).mean() / 0.04, 0.0, 1.0)
+        return np.concatenate([self.sim.data.site_xpos[site] - self.base(), turn, [gripper_position]])
 
     def step(self, target):
         target, state = next(self.script) if target is None else np.asarray(target), self.state()

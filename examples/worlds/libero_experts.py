@@ -1,8 +1,8 @@
 """The scripted expert of libero.py, which uses the true positions of objects and yields targets without end.
 
-A target is a pose of the grip site in the frame of the robot's base, and a closedness. Objects are grasped from above.
-An object that is too wide for the fingers, such as a bowl, is grasped at its rim, where the gripper has the fewest
-collisions.
+A target is a pose of the grip site in the frame of the robot's base, and a gripper position. Objects are grasped from
+above. An object that is too wide for the fingers, such as a bowl, is grasped at its rim, where the gripper has the
+fewest collisions.
 """
 
 import numpy as np
@@ -84,7 +84,7 @@ class Expert:
         local = np.einsum("pji,pcj->pci", turns, points - places) - model.geom_aabb[parts, None, :3]
         return (np.abs(local) < model.geom_aabb[parts, None, 3:] + NEAR_M).all(-1).any(0).sum()
 
-    def go(self, position, closedness, near=NEAR_M, max_steps=60):
+    def go(self, position, gripper_position, near=NEAR_M, max_steps=60):
         """Yield targets until the hand is at `position()`, which may change, or does not move any more."""
         hands = []
         for _ in range(max_steps):
@@ -92,12 +92,12 @@ class Expert:
             is_stuck = len(hands) > 5 and np.ptp(hands[-5:], axis=0).max() < 0.003
             if is_stuck or np.linalg.norm(position() - hands[-1]) < near:
                 break
-            yield np.array([*position(), *self.rotation, closedness])
+            yield np.array([*position(), *self.rotation, gripper_position])
 
-    def grip(self, closedness, steps=8):
+    def grip(self, gripper_position, steps=8):
         state = self.world.state()
         for _ in range(steps):
-            yield np.array([*state[:3], *self.rotation, closedness])
+            yield np.array([*state[:3], *self.rotation, gripper_position])
 
     def grasp(self, name, carry):
         """Return the position and rotation of a grasp from above with the fewest collisions, also on the way.

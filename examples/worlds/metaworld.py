@@ -4,7 +4,8 @@
     vjepa2-ac simulate RUN --world "worlds/metaworld/bin/python examples/worlds/metaworld.py push-v3"
 
 State and targets: the pose of the hand in the frame of the robot's base (metres, extrinsic xyz Euler angles in radians;
-rotations of targets are ignored), and the closedness from 0 (open) to 1. An unknown task prints the names of all tasks.
+rotations of targets are ignored), and the gripper position from 0 (open) to 1. An unknown task prints the names of all
+tasks.
 """
 
 from serve_environment import serve  # first: it moves this folder behind installed packages

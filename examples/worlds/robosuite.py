@@ -4,7 +4,7 @@
     vjepa2-ac simulate RUN --world "worlds/robosuite/bin/python examples/worlds/robosuite.py Lift"
 
 State and targets: the pose of the grip site in the frame of the robot's base (metres, extrinsic xyz Euler angles in
-radians), and the closedness of the gripper from 0 (open) to 1. All arms have the Panda gripper; the door has no latch.
+radians), and the gripper position from 0 (open) to 1. All arms have the Panda gripper; the door has no latch.
 """
 
 from serve_environment import serve  # first: it moves this folder behind installed packages
@@ -46,8 +46,8 @@ class World:
 
     def step(self, target):
         if target is None:
-            position, rotation, closedness = next(self.script)
-            target = [*self.pose_in_base(position, rotation), closedness]
+            position, rotation, gripper_position = next(self.script)
+            target = [*self.pose_in_base(position, rotation), gripper_position]
         state = self.state()
         if abs(target[6] - state[6]) > 0.1:  # smaller changes are ignored, so that a grasped object is not dropped
             self.closing = np.sign(target[6] - state[6])

@@ -1,6 +1,6 @@
 """Scripted experts of robosuite.py, which yield targets of the hand without end, and distances to goals.
 
-Each target has the position and the rotation of the grip site in the world frame, and a closedness.
+Each target has the position and the rotation of the grip site in the world frame, and a gripper position.
 """
 
 import numpy as np
@@ -22,12 +22,12 @@ class Expert:
     def __init__(self, world):
         self.world, self.rotation = world, world.hand()[1]
 
-    def go(self, position, closedness, near=0.03):
+    def go(self, position, gripper_position, near=0.03):
         while np.linalg.norm(position() - self.world.hand()[0]) > near:
-            yield position(), self.rotation, closedness
+            yield position(), self.rotation, gripper_position
 
-    def hold(self, closedness, steps=8):
-        yield from [(self.world.hand()[0], self.rotation, closedness)] * steps
+    def hold(self, gripper_position, steps=8):
+        yield from [(self.world.hand()[0], self.rotation, gripper_position)] * steps
 
     def turn(self, angle):
         self.rotation = Rotation.from_euler("z", angle) * self.rotation

@@ -94,8 +94,8 @@ def read_clips(dataset: Dataset, split: Split = "train", *, clips: int = 16, bat
 
     Yields:
         Batches of `frames` (clips x time x height x width x 3, uint8, RGB, cropped; None for cached latents), `states`
-        (clips x time x 7: metres, radians, closedness), `actions` (clips x time-1 x 7: the changes), `episode_ids` and
-        `starts` (control steps). Axes, units and coordinate frames: `vjepa2_ac.episode`.
+        (clips x time x 7: metres, radians, gripper position), `actions` (clips x time-1 x 7: the changes),
+        `episode_ids` and `starts` (control steps). Axes, units and coordinate frames: `vjepa2_ac.episode`.
 
     Raises:
         InputError: The split has no clips, `data.stride` is auto, or a clip cannot be read.

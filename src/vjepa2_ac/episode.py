@@ -9,13 +9,13 @@ Axes
     dim      width of a latent (1408 for ViT-g)
 
 State (7 numbers, a pose): x, y, z in metres; roll, pitch, yaw in radians, as extrinsic xyz Euler angles; gripper
-    closedness, 0 open .. 1 closed. All in the robot base frame (x to the robot's front, y to its left, z up); the point
-    is the flange, not the finger tip. States are *measured*. With `data.states: vector` a state is a
+    gripper position, 0 open .. 1 closed. All in the robot base frame (x to the robot's front, y to its left, z up); the
+    point is the flange, not the finger tip. States are *measured*. With `data.states: vector` a state is a
     vector of state_dim numbers from the source.
 
 Action (7 numbers, of a pose): the change from a state to the state of the next *model* step: metres, extrinsic xyz
-    Euler angles of R[t+1] @ R[t].T, and the change of closedness. See `spaces.actions_from_states`. For vectors see
-    `data.actions`.
+    Euler angles of R[t+1] @ R[t].T, and the change of gripper position. See `spaces.actions_from_states`. For vectors
+    see `data.actions`.
 
 Extrinsics (6 numbers): the camera in the robot base frame: x, y, z, roll, pitch, yaw.
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MAX_POSITION_M = 5.0  # larger positions are not in metres
 MAX_ANGLE_RAD = 2 * math.pi + 0.1  # larger angles are not in radians
 _GIMBAL_LOCK = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw is determined
-GRIPPER_SLACK = 0.1  # a measured closedness may exceed 0 .. 1 by this
+GRIPPER_SLACK = 0.1  # a measured gripper position may exceed 0 .. 1 by this
 CONVERSIONS = {  # conversions from other units to metres and radians
     "millimetres": "divide them by 1000",
     "centimetres": "divide them by 100",
@@ -145,7 +145,7 @@ class Space:
     units: tuple[str, ...]
     position: slice | None = None  # metres
     rotation: slice | None = None  # extrinsic xyz Euler angles
-    gripper: int | None = None  # closedness, 0 open .. 1 closed
+    gripper: int | None = None  # gripper position, 0 open .. 1 closed
 
     def __len__(self) -> int:
         return len(self.names)
@@ -216,7 +216,7 @@ class StateSpace(Space):
         fix: str = "",
         conversions: Mapping[str, str] = CONVERSIONS,
     ) -> None:
-        """Refuse implausible states: numbers that are not finite, and poses not in metres, radians and closedness.
+        """Refuse implausible states: numbers that are not finite, or that seem to have other units.
 
         Args:
             states: One for each control step.
@@ -265,8 +265,8 @@ class StateSpace(Space):
         if self.rotation is not None:
             checks.append((abs(states[:, self.rotation]).max(axis=1) > MAX_ANGLE_RAD, "angles in radians"))
         if self.gripper is not None:
-            closedness = states[:, self.gripper]
-            is_beyond = (closedness < -GRIPPER_SLACK) | (closedness > 1 + GRIPPER_SLACK)
+            gripper_position = states[:, self.gripper]
+            is_beyond = (gripper_position < -GRIPPER_SLACK) | (gripper_position > 1 + GRIPPER_SLACK)
             checks.append((is_beyond, "a gripper between 0 and 1: 0 for open, 1 for closed"))
         return checks
 
@@ -373,8 +373,8 @@ def apply_actions(
         after = states + actions if space.rotation is None else apply_action(states, actions)
     if space.gripper is None:
         return after
-    closedness = after[..., space.gripper :].clamp(0.0, 1.0)  # the last number
-    return torch.cat([after[..., : space.gripper], closedness], dim=-1)  # type: ignore[no-any-return]  # untyped
+    gripper_position = after[..., space.gripper :].clamp(0.0, 1.0)  # the last number
+    return torch.cat([after[..., : space.gripper], gripper_position], dim=-1)  # type: ignore[no-any-return]  # untyped
 
 
 def integrate_changes(
@@ -404,9 +404,9 @@ def integrate_states(
 def clip_gripper_changes(
     state: Float[np.ndarray, " state_dim"], actions: Float[np.ndarray, "steps state_dim"], space: StateSpace = POSE
 ) -> Float[np.ndarray, "steps state_dim"]:
-    """Return actions whose gripper changes stay within the range 0 .. 1 of closedness, as in `integrate_states`.
+    """Return actions whose gripper changes stay within the range 0 .. 1 of gripper position, as in `integrate_states`.
 
-    A measured closedness does not exceed its range, so the training data contain no changes beyond it.
+    A measured gripper position does not exceed its range, so the training data contain no changes beyond it.
     """
     feasible = np.array(actions, dtype=np.float64)
     if space.gripper is not None:

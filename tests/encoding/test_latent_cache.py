@@ -364,9 +364,7 @@ def test_cache_of_another_encoder_raises_with_the_difference(
     original, cached = shared_cache
     encoding = replace(NUMBERS, parts={**NUMBERS.parts, **change})
     monkeypatch.setattr(batch, "get_encoding", lambda model, _: model)
-    with pytest.raises(
-        InputError, match=f"no latent cache.*other caches in its folder: 1.*{message}.*vjepa2-ac encode"
-    ):
+    with pytest.raises(InputError, match=f"no latent cache.*The folder has 1 other cache.*{message}.*vjepa2-ac encode"):
         LatentCache.for_dataset(original, encoding).open_dataset()
     with pytest.raises(InputError, match=message):
         batch.require_same_encoder(encoding, open_cache_only(cached), None)  # type: ignore[arg-type]

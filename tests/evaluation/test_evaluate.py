@@ -68,7 +68,7 @@ def test_a_perfect_predictor_scores_zero_in_every_metric(oracle: Evaluation) -> 
                 assert ratio.value == pytest.approx(0.0, abs=1e-5)
     assert [gain.value for gain in gain_over(*adapter_and_base_errors(oracle))] == pytest.approx([1.0] * (TIME - 1))
     summary = summarize(oracle, make_rows(oracle))
-    assert summary.prediction.statement.startswith("error 100 % lower than the base model's")
+    assert summary.prediction.statement.startswith("1.0 s ahead, error 100 % lower than the base model's")
     assert summary.sensitivity.conclusion == "yes"
 
 

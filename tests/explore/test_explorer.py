@@ -113,7 +113,7 @@ def test_unreachable_target_is_reported(live: Views) -> None:
         (RolloutPosition(99, 0), "episode 99"),
         (RolloutPosition(0, 10_000), "control step 10000"),
         (RolloutPosition(0, 0, ((1.0,),)), "1 numbers"),
-        (RolloutPosition(0, 0, ((50.0, 0, 0, 0, 0, 0, 0),)), "in metres, radians and closedness"),
+        (RolloutPosition(0, 0, ((50.0, 0, 0, 0, 0, 0, 0),)), "in metres, radians and gripper position"),
         (RolloutPosition(0, 0, (UP,) * (MAX_STEPS + 1)), f"at most {MAX_STEPS}"),
     ],
 )

@@ -17,7 +17,7 @@ from vjepa2_ac.goals.key_frames import (
 
 
 def make_states(*parts: tuple[int, float, float]) -> np.ndarray:
-    """Return states that change linearly in each part: (number of frames, change of x in metres, of closedness)."""
+    """Return states that change linearly in each part (frames, change of x, change of gripper position)."""
     x, grip = [0.4], [0.0]
     for frames, metres, closes in parts:
         x += (x[-1] + metres * np.arange(1, frames + 1) / frames).tolist()

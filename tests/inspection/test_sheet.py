@@ -38,7 +38,7 @@ def strip(colour: tuple[int, int, int] = (200, 30, 40), *, steps: int = 30, size
         success=True,
         frames=np.full((count, *size, 3), colour, np.uint8),
         speed=np.linspace(0, 20, steps),
-        closedness=np.linspace(0, 1, steps),
+        gripper_position=np.linspace(0, 1, steps),
         unused=((0, 2),),
         crop=crop_box(*size),
     )

@@ -77,7 +77,7 @@ def test_calibration_recovers_the_stride_of_the_training(learned: int) -> None:
     calibration = calibrated(ConstantVelocity(learned), tracks([80] * 20, noise=0.1))
     assert calibration.stride == learned
     assert calibration.is_certain
-    assert "not significant" not in calibration.verdict()
+    assert "uncertain" not in calibration.verdict()
 
 
 def test_ratios_equal_values_computed_by_hand() -> None:
@@ -110,7 +110,7 @@ def test_persistence_model_has_no_significant_best_stride() -> None:
     calibration = calibrated(ConstantVelocity(0), tracks([80] * 6, noise=0.2))
     assert [one.ratio.value for one in calibration.results.values()] == [1.0, 1.0, 1.0]
     assert not calibration.is_certain
-    assert "not significant" in calibration.verdict()
+    assert "uncertain" in calibration.verdict()
     assert "The model is not better than persistence at any stride" in calibration.verdict()
 
 

@@ -160,7 +160,7 @@ def test_merged_run_has_the_dtype_of_its_base_and_fingerprints_of_the_trained_we
     assert reported["dtype"] == "bfloat16"
 
 
-CHANGES_IN_DATA = [0.03, 0.02, 0.01, 0.0, 0.1, 0.2, 0.8]  # metres, radians, closedness
+CHANGES_IN_DATA = [0.03, 0.02, 0.01, 0.0, 0.1, 0.2, 0.8]  # metres, radians, gripper position
 
 
 @pytest.fixture

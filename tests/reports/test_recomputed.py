@@ -93,7 +93,7 @@ def recomputed(metrics: dict[str, Any]) -> dict[str, tuple[str, str, str]]:
         of_base, reference, reference_error = models[base]["distribution"], "base model", "the base model's"
         before = of_base["variance"][-1] / of_base["true_variance"][-1]
     texts_by_verdict["prediction"] = (
-        f"error {share} % lower than {reference_error}, {ahead}",
+        f"{ahead}, error {share} % lower than {reference_error}",
         interval,
         f"(part of the gain may be blur: spread {spread:.2f}, {reference} {before:.2f})",
     )

@@ -78,7 +78,7 @@ def test_named_goal_or_prompt_selects_a_goal_of_the_server() -> None:
     second = ask(served, **request(2, prompt="two"))
     assert (second["goal"]["name"], second["goal"]["index"], second["goal"]["since"]) == ("b", 1, 1)
     assert "the limit of 1 step is reached" in second["goal"]["changed"]
-    assert "the name of a goal (this server has cup, two)" in get_error(served, **request(prompt="cap"))
+    assert "the name of a goal (the goals of this server are cup, two)" in get_error(served, **request(prompt="cap"))
     assert "no goal was set in this episode" in get_error(served, **request(3)), (
         "an invalid goal does not leave the previous goal active"
     )

@@ -27,7 +27,7 @@ def synthetic_states(steps: int, *, seed: int = 0) -> Float[np.ndarray, "steps 7
 def draw_frame(
     state: Float[np.ndarray, " 7"], *, size: tuple[int, int] = (180, 320), camera: int = 0
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Return an image that shows the pose: a disc at the gripper, coloured by closedness, and a bar for the yaw."""
+    """Return an image that shows the pose: a disc coloured by the gripper position, and a bar for the yaw."""
     height, width = size
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
     frame = np.stack(
@@ -75,7 +75,7 @@ def synthetic_episode(
 
 
 def measured_states(episode: DroidEpisode) -> Float[np.ndarray, "steps 7"]:
-    """Return the measured poses and closedness of an episode."""
+    """Return the measured poses and gripper position of an episode."""
     measured = [episode.arrays[f"observation/{name}_position"] for name in ("cartesian", "gripper")]
     return np.concatenate(measured, axis=1)
 

@@ -61,7 +61,7 @@ def test_strip_shows_the_clip_with_the_most_motion(make_config, reporter, decode
         distances[run.dataset.table.identity(episode), start] = np.linalg.norm(np.diff(states, axis=0), axis=1).sum()
     assert (strip.episode_id, strip.start) == max(distances, key=lambda name: distances[name])
     assert [(rollout.model, rollout.name, len(rollout.frames)) for rollout in strip.rollouts] == [
-        ("base", AS_RECORDED, 3), ("model now", AS_RECORDED, 3),
+        ("base", AS_RECORDED, 3), ("current model", AS_RECORDED, 3),
     ]  # fmt: skip
     assert np.array_equal(strip.rollouts[0].frames, strip.rollouts[1].frames), (
         "a new adapter must not change predictions"

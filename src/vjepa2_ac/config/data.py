@@ -68,7 +68,7 @@ class IdleConfig(Section):
     rotation_rad: Positive = 5e-3
     """For rule motion: the limit of the rotation in radians."""
     gripper: Positive = 1e-2
-    """For rule motion: the limit of the gripper's change of closedness (0 to 1)."""
+    """For rule motion: the limit of the change of the gripper position (0 to 1)."""
     shortest_idle_steps: PositiveInt = 7
     """Idle ranges with fewer steps are kept."""
     shortest_kept_steps: PositiveInt = 16

@@ -46,7 +46,7 @@ class LimitsConfig(Section):
     """Only for vectors: the largest change of each number, in the unit of the number; a single value holds for all
     numbers. data: the 99th percentile of each number's change in the training data."""
     gripper: ZeroToOne = 0.75
-    """Largest change of the gripper's closedness."""
+    """Largest change of the gripper position."""
     gripper_mode: Literal["rounded", "free", "held", "open", "close"] = "rounded"
     """rounded: changes below 0.25 in the final plan are set to zero, as upstream. free: changes are not modified. held:
     no change. open, close: a change of -1 or 1 in every model step, independent of `gripper`."""

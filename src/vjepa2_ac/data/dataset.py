@@ -92,9 +92,9 @@ class Dataset:
 
         Returns:
             `len(clips)` clips; `clips[i]` is an `episode.Clip` of `frames` (time x height x width x 3, uint8, RGB,
-            cropped; None for a latent cache, which has `latents`), `states` (time x 7: metres, radians, closedness) and
-            `actions` (time-1 x 7), float32. A DataLoader collates clips to an `episode.Batch` of tensors. It may
-            shuffle and use any number of workers; for data behind a URL the workers must not be forked.
+            cropped; None for a latent cache, which has `latents`), `states` (time x 7: metres, radians, gripper
+            position) and `actions` (time-1 x 7), float32. A DataLoader collates clips to an `episode.Batch` of tensors.
+            It may shuffle and use any number of workers; for data behind a URL the workers must not be forked.
 
         Raises:
             InputError: There is no such split, it has no clips, or `data.stride` is auto. `clips[i]` raises the error

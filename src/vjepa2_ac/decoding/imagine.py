@@ -76,14 +76,14 @@ class DecodedRollout:
     actions: Actions
     frames: Frames  # predicted frame after each action
     truth: Frames | None = None
-    outlines: Bool[np.ndarray, "time size size"] | None = None  # true mask of the arm, including the start frame
+    outlines: Bool[np.ndarray, "time size size"] | None = None  # true masks of the arm, one per frame
 
 
 @dataclass(frozen=True, eq=False)
 class RolloutComparison:
     """All decoded rollouts from one start. All frames have the crop and size of the encoder's input."""
 
-    subject: str
+    subject: str  # title of the model, such as the run and its step
     episode_id: str  # "" for an image that is not from a data set
     start: int  # control step of the first frame
     seconds_per_step: float
@@ -131,7 +131,8 @@ def describe_poor_reconstruction(card: DecoderCard, first: Image, decoded_first:
         return ()
     note = (
         f"The decoder reconstructs the start frame with a PSNR of {psnr_db:.1f} dB, compared with {usual_db:.1f} dB on"
-        f" its held-out frames. The latents may contain details that the images lack. Train a decoder on this scene."
+        " its held-out frames. The latents may contain details that are not visible in the decoded images."
+        " Train a decoder on this scene."
     )
     return (note,)
 
@@ -187,7 +188,7 @@ def _describe_actions(rollout: DecodedRollout) -> str:
 
 
 def _describe_action(action: Float[np.ndarray, " action_dim"]) -> str:
-    """Return a description of an action of poses, such as "left 2.0, up 1.0 cm, close"; empty for vectors."""
+    """Return a description of a change of the pose, such as "left 2.0, up 1.0 cm, close"; empty for vectors."""
     if len(action) != _POSE:
         return ""
     components = []
@@ -208,7 +209,7 @@ def _shorten_name(name: str) -> str:
 
 
 def write_rollouts(comparison: RolloutComparison, folder: Path, *, reporter: Reporter = SILENT) -> list[Path]:
-    """Write image strip, video and GIF, and return their paths; without PyAV a note replaces the video.
+    """Write image strip, video and GIF, and return their paths; without PyAV only the strip and the GIF.
 
     Raises:
         InputError: The folder cannot be written.
@@ -229,7 +230,7 @@ def write_rollouts(comparison: RolloutComparison, folder: Path, *, reporter: Rep
 
 
 class ValidationStrip:
-    """A training hook that draws an image strip at each validation: true frames, and predictions of base and model.
+    """A training hook that draws an image strip at each validation, with predictions of the base and the current model.
 
     The clip is always the one with the most motion among the validation clips (of rank 0). An error while drawing does
     not end the run: it is logged as a warning, and there is no strip.
@@ -298,7 +299,7 @@ class ValidationStrip:
             predicted = compute_rollout(world_model.rollout, start, actions, states[:-1])
             return DecodedRollout(name, AS_RECORDED, actions, decode_views(decoder, predicted))
 
-        rollouts, adaptation = [predict("model now")], world_model.adaptation
+        rollouts, adaptation = [predict("current model")], world_model.adaptation
         if adaptation is not None and adaptation.kind == "lora" and world_model.new_input_projections is None:
             with use_base_weights(world_model):
                 rollouts.insert(0, predict("base"))

@@ -51,7 +51,7 @@ from vjepa2_ac.storage import free_bytes
 _GIGABYTE = 10**9
 FRAMES_AT_ONCE = 64  # consecutive frames of an episode that are decoded together: at most 180 MB at 720p
 _PREFETCHED_PARTS = 2  # parts per thread: one in progress and one ready
-_MAX_PENDING_WRITES = 2  # files; a limit of the memory
+_MAX_PENDING_WRITES = 2  # number of files; limits the memory use
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def needed_frames(dataset: Dataset) -> Iterator[FramesToEncode]:
 
 @dataclass(frozen=True, eq=False)
 class LatentCache:
-    """The latent cache of an open data set, finished or not. Several processes may write into its folder.
+    """The latent cache of a `Dataset`, finished or not. Several processes may write into its folder.
 
     The cache is finished when no file is missing. It needs no repair after a process was killed, a file was deleted or
     an episode was added: the next encoding writes the missing files.
@@ -141,7 +141,7 @@ class LatentCache:
 
     @property
     def broken(self) -> dict[int, str]:
-        """The reason of each episode that a process could not read, by the index of the episode."""
+        """Why a process could not read an episode, by the index of the episode; readable episodes are not included."""
         reasons, episodes = self.files.broken_reasons, {request.episode for request in self.requests}
         return {episode: reason for episode, reason in reasons.items() if episode in episodes}
 
@@ -162,7 +162,7 @@ class LatentCache:
         """Refuse a folder that contains another cache or other files.
 
         Raises:
-            InputError: The folder contains another cache, and the message lists the differences; or other files.
+            InputError: The folder contains other files, or another cache; the message lists how the caches differ.
         """
         require_matching_folder(self.folder, CACHE_FILE, self.key, where=f"latent cache {self.folder}")
 
@@ -189,7 +189,7 @@ class LatentCache:
         """Refuse to start if the local disk has too little space for the missing frames; URLs are not checked.
 
         Raises:
-            InputError: The space is too small; the message has the free and the required space, and fixes.
+            InputError: The disk has too little space; the message states the free and the required space, and a fix.
         """
         if not isinstance(self.folder, Path):
             return
@@ -213,7 +213,7 @@ class LatentCache:
                 differing = read_cache_key(other_folder).list_differences(self.key.parts)
                 other_caches.append((len(differing), f"{name}, which differs: {'; '.join(differing)}"))
         nearest = (
-            f". Number of other caches in its folder: {len(other_caches)}. Most similar: {min(other_caches)[1]}"
+            f". The folder has {counted(len(other_caches), 'other cache')}. Most similar: {min(other_caches)[1]}"
             if other_caches
             else ""
         )
@@ -246,7 +246,7 @@ def require_space(folder: Path, frames: int, per_frame: int, *, fix: str) -> Non
     """
     needed, free = frames * per_frame, free_bytes(folder)
     if needed > free:
-        size = f"{needed / _GIGABYTE:.4g} GB for the latents of {frames:,} frames ({per_frame / 1e6:.3g} MB each)"
+        size = f"{needed / _GIGABYTE:.4g} GB for {frames:,} frames ({per_frame / 1e6:.3g} MB each)"
         raise InputError(where=str(folder), found=f"{free / _GIGABYTE:.4g} GB free on the disk", needed=size, fix=fix)
 
 

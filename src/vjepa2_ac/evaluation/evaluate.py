@@ -247,7 +247,7 @@ def _examples(
 # ---- the clips ----
 
 # A step with a change of the pose is idle if the speed of the flange, its angular speed and the change of the gripper's
-# closedness are all below these limits.
+# gripper position are all below these limits.
 SPEED_CM_S = 2.0
 TURN_DEGREES_S = 10.0
 GRIP = 0.05  # in a model step

@@ -1,4 +1,4 @@
-"""The rows of an evaluation: all numbers with their intervals, for console, page, metrics.json and comparison.
+"""The rows of an evaluation: all numbers and intervals, for console, report, metrics.json and comparison of runs.
 
 PyTorch is not imported.
 """
@@ -33,7 +33,7 @@ from vjepa2_ac.evaluation.result import (
 from vjepa2_ac.intervals import Estimate
 
 _Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]  # null in JSON: NaN
-_MOST_HORIZONS = 8  # number of horizons in the console's tables
+_MOST_HORIZONS = 8  # number of horizons in the console's tables, in addition to the first
 _SIMILARITIES = {"psnr_db": ("PSNR (dB)", ".1f"), "ssim": ("SSIM", ".3f")}
 _REGIONS = {"whole": "whole image", "moving": "moving region"}
 _GAIN: dict[str, Any] = {"form": ".1%", "better": "higher", "chance": 0.0}
@@ -175,7 +175,7 @@ class _Rows(list[Row]):
         distributions = {PERSISTENCE: evaluation.copies, **models}
         spreads, last = {name: each.spread for name, each in distributions.items()}, {evaluation.horizon}
         self.add_curves(
-            "Spread of the predictions relative to the true latents, open loop (ratio, 1: as varied)",
+            "Spread of the predictions, open loop (relative to the true latents; 1: as varied as these)",
             "spread",
             spreads,
             last,
@@ -185,7 +185,7 @@ class _Rows(list[Row]):
         group = f"Squared MMD between predicted and true latents x 100, open loop ({sample_size}; unbiased)"
         self.add_curves(group, "latent_mmd", {name: each.mmd for name, each in distributions.items()})
         by_chance = evaluation.fvd_of_halves
-        halves = f"; two halves of the true clips: {by_chance:.3g}" if math.isfinite(by_chance) else ""
+        halves = f"; between two halves of the true clips: {by_chance:.3g}" if math.isfinite(by_chance) else ""
         group = f"Fréchet distance between predicted and true latents (FVD; {sample_size}; biased upwards{halves})"
         style: dict[str, Any] = {"form": ".3g", "detail": True}
         distances = {name: each.fvd for name, each in distributions.items()}
@@ -225,7 +225,7 @@ class _Rows(list[Row]):
         group = "Action-ranking error: fraction of alternative actions with a lower energy than the true action"
         style: dict[str, Any] = {"form": ".1%", "chance": 0.5}
         self.add_line(group, "all alternatives", "ranking.rank", {model: ranking.rank}, **style)
-        self.add_line(group, "alternatives from the box", "ranking.box", {model: ranking.box}, **style)
+        self.add_line(group, "alternatives from the box of actions", "ranking.box", {model: ranking.box}, **style)
         self.add_line(
             group, "alternatives as long as the true action", "ranking.shell", {model: ranking.shell}, **style
         )

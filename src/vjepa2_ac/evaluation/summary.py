@@ -34,7 +34,7 @@ _MIN_ORACLE_RATE = 0.5  # problems are too hard for a comparison if the oracle's
 _BASE, _PERSISTENCE, _CHANCE = "the base model", "persistence", "chance"  # values of `compared_with`
 _TOO_FEW = "too few for a conclusion"
 _COLUMNS, _NO_BREAK = 90, "\N{NO-BREAK SPACE}"
-_NUMBER = re.compile(r"\d[\d.]*(?: (?:%|cm))?")  # the first match in a statement is the verdict's number
+_NUMBER = re.compile(r"\d[\d.]*+(?! s\b)(?: (?:%|cm))?")  # the first match in a statement is the verdict's number
 _wrap = partial(wrap, break_on_hyphens=False)  # commands and paths contain hyphens and must not be broken
 
 
@@ -318,7 +318,7 @@ def _describe_blur(rows: Mapping[str, Row], base_rows: Mapping[str, Row], horizo
 
 def _judge_gain(gain: Estimate, compared_with: str, ahead: str) -> Verdict:
     reference = "the base model's" if compared_with == _BASE else f"that of {compared_with}"
-    statement = f"error {_format_change(gain, 'lower', 'higher')} than {reference}, {ahead}"
+    statement = f"{ahead}, error {_format_change(gain, 'lower', 'higher')} than {reference}"
     return _make_verdict(PREDICTION, draw_conclusion(gain, SAME_ERROR), statement, gain, compared_with)
 
 

@@ -157,7 +157,7 @@ class Explorer:
         width, checked = len(self.spaces.state), RolloutPosition(position.episode, position.start)
         for action in position.actions:
             if len(action) != width or not np.isfinite(action).all() or np.abs(action).max() > np.pi:
-                needed = f"{width} numbers of one step in metres, radians and closedness, each at most pi"
+                needed = f"{width} numbers of one step in metres, radians and gripper position, each at most pi"
                 raise InputError(where="actions", found=f"{len(action)} numbers", needed=needed)
             recorded = self.get_next_recorded_action(checked)
             is_recorded = recorded is not None and np.allclose(action, recorded, atol=_ACTION_TOLERANCE)

@@ -19,8 +19,8 @@ from vjepa2_ac.spaces import actions_from_states
 
 States = Float[np.ndarray, "frames 7"]
 
-MIN_GRIPPER_CHANGE = 0.15  # smallest difference of closedness that counts as a change of the gripper
-_MIN_FINGER_MOTION = 0.02  # smallest change of closedness between two frames that counts as motion of the fingers
+MIN_GRIPPER_CHANGE = 0.15  # smallest difference of gripper position that counts as a change of the gripper
+_MIN_FINGER_MOTION = 0.02  # smallest change of gripper position between two frames that counts as motion of the fingers
 _MAX_PAUSE = 2  # frames for which the fingers may rest within one change
 _STILL_M, _STILL_RAD = 0.002, 0.02  # the arm rests if it moves less than this between two frames
 _MIN_DEPARTURE_M = 0.01  # the arm has left the position of a grip if it is at least this far away
@@ -55,7 +55,7 @@ def find_gripper_key_frames(states: States, rule: StillRule | None = None) -> tu
     which the arm came to rest replaces the last frame.
 
     Args:
-        states: Measured states, with closedness last (conventions: `vjepa2_ac.episode`).
+        states: Measured states, with gripper position last (conventions: `vjepa2_ac.episode`).
         rule: The rule for stops.
 
     Raises:
@@ -84,17 +84,21 @@ def find_gripper_key_frames(states: States, rule: StillRule | None = None) -> tu
     return tuple(KeyFrame(frame, names[frame]) for frame in sorted(names))
 
 
-def _find_gripper_changes(closedness: Float[np.ndarray, " frames"]) -> list[tuple[int, int]]:
+def _find_gripper_changes(gripper_position: Float[np.ndarray, " frames"]) -> list[tuple[int, int]]:
     """Return the first and the last frame of each change of the gripper in one direction."""
     changes: list[tuple[int, int, float]] = []  # first frame, last frame, direction
-    for frame, difference in enumerate(np.diff(closedness)):
+    for frame, difference in enumerate(np.diff(gripper_position)):
         if abs(difference) < _MIN_FINGER_MOTION:
             continue
         if changes and changes[-1][2] == np.sign(difference) and frame - changes[-1][1] <= _MAX_PAUSE:
             changes[-1] = (changes[-1][0], frame + 1, changes[-1][2])
         else:
             changes.append((frame, frame + 1, float(np.sign(difference))))
-    return [(begin, end) for begin, end, _ in changes if abs(closedness[end] - closedness[begin]) >= MIN_GRIPPER_CHANGE]
+    return [
+        (begin, end)
+        for begin, end, _ in changes
+        if abs(gripper_position[end] - gripper_position[begin]) >= MIN_GRIPPER_CHANGE
+    ]
 
 
 def _find_end_of_change(states: States, begin: int, end: int) -> int:
@@ -117,10 +121,10 @@ def _is_same(first: Float[np.ndarray, " 7"], second: Float[np.ndarray, " 7"]) ->
 
 
 def _are_below(
-    changes: Float[np.ndarray, "pairs 7"], metres: float, radians: float, closedness: float
+    changes: Float[np.ndarray, "pairs 7"], metres: float, radians: float, gripper_position: float
 ) -> Bool[np.ndarray, " pairs"]:
     moved, turned = (np.linalg.norm(changes[:, part], axis=1) for part in (slice(0, 3), slice(3, 6)))
-    return np.asarray((moved < metres) & (turned < radians) & (np.abs(changes[:, GRIPPER]) < closedness))
+    return np.asarray((moved < metres) & (turned < radians) & (np.abs(changes[:, GRIPPER]) < gripper_position))
 
 
 def add_frames_between(keys: Sequence[KeyFrame], step: int, name: str = "on the way") -> tuple[KeyFrame, ...]:

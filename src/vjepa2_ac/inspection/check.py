@@ -31,7 +31,7 @@ _DARK = 8  # frames with a lower mean (0 to 255) are nearly black
 _STILL_CM, _FAR_CM = 0.2, 30.0  # plausible medians of the motion per model step
 _REACH_M = 1.6  # larger distances are beyond the reach of common arms
 _MAX_REASON = 300  # maximum number of characters of a reason in a message
-_OPEN = 0.2  # if the closedness of a gripper never exceeds this, the values may be widths in metres
+_OPEN = 0.2  # if the gripper position never exceeds this, the values may be widths in metres
 _LARGE = 100.0  # larger values in vectors are implausible for radians, metres and fractions
 _MAX_LISTED = 8  # maximum number of indices in a message
 
@@ -204,7 +204,7 @@ def _pose_findings(
     states: Float[np.ndarray, "rows 7"], actions: Float[np.ndarray, "pairs 7"], clips: int
 ) -> Iterator[Finding]:
     """Yield the findings about position, rotation, gripper and actions."""
-    positions, angles, closedness = states[:, POSE.position], states[:, POSE.rotation], states[:, POSE.gripper]
+    positions, angles, gripper_position = states[:, POSE.position], states[:, POSE.rotation], states[:, POSE.gripper]
     low, high = positions.min(axis=0), positions.max(axis=0)
     extent, reach = (high - low).max(), np.linalg.norm(positions, axis=1).max()
     too_far = f"positions are up to {reach:.2f} m from the base, beyond the reach of most arms ({_REACH_M:g} m)"
@@ -229,14 +229,14 @@ def _pose_findings(
     )
     yield first_case(
         "gripper",
-        f"{closedness.min():.2f} to {closedness.max():.2f} (0 open, 1 closed)",
+        f"{gripper_position.min():.2f} to {gripper_position.max():.2f} (0 open, 1 closed)",
         (
-            np.ptp(closedness) == 0,
+            np.ptp(gripper_position) == 0,
             "warning",
             f"the gripper never moves in {counted(clips, 'clip')}. Check that the state contains it",
         ),
         (
-            closedness.max() < _OPEN,
+            gripper_position.max() < _OPEN,
             "warning",
             "the gripper never closes. Check that it is 0 to 1, not a width in metres",
         ),

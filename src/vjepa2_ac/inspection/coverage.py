@@ -46,7 +46,7 @@ _SMALL_CM = 1.0  # shorter steps are hardly visible in an image
 _MIN_STEPS = 100  # minimum number of steps that do not overlap
 _ROWS, _COLUMNS, _MAX_STEPS = 24, 48, 5000  # cells of the map of directions, and maximum number of steps used for it
 _SAME_DIRECTION, _SAME_AXIS, _SAME_PLANE, _PREFERRED = 0.8, 0.8, 0.1, 0.3  # thresholds of `_describe_directions`
-_GRIPPER = 0.1  # smallest change of closedness that counts as motion of the gripper
+_GRIPPER = 0.1  # smallest change of gripper position that counts as motion of the gripper
 _HARDLY = 0.01  # smaller changes of a vector's numbers count as rest, because the numbers are of the order of 1
 # A number of a vector changes in both directions if it increases, and decreases, by more than _STEP x its usual change
 # in at least _OFTEN of the steps. Vectors have low diversity if at most _HALF of the numbers change in both directions.

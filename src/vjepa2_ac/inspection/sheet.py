@@ -39,7 +39,7 @@ class Strip:
     success: bool | None
     frames: UInt8[np.ndarray, "time height width 3"]
     speed: Float[np.ndarray, " steps"]  # cm/s of the flange; for vectors see `plot_contact_sheet`
-    closedness: Float[np.ndarray, " steps"] | None  # None: the states are not poses
+    gripper_position: Float[np.ndarray, " steps"] | None  # None: the states are not poses
     unused: tuple[tuple[int, int], ...]  # ranges [start, end) of steps from which no clips are taken
     crop: CropBox  # part of the image that is the model's input
 
@@ -88,7 +88,7 @@ def _read_strip(inspection: Inspection, without_frames: ReadEpisode, name: str) 
         success=episode.info.success,
         frames=episode.read_frames([int(step) for step in steps_with_frames[shown]]),
         speed=change * episode.control_rate_hz,
-        closedness=states[:, space.gripper] if is_pose else None,
+        gripper_position=states[:, space.gripper] if is_pose else None,
         unused=tuple(find_runs(is_unused)),
         crop=crop_box(height, width, dataset.config.crop),
     )
@@ -231,8 +231,8 @@ def _draw_strip_motion(axes: Any, strip: Strip, control_rate_hz: float, max_spee
         axes.axvspan(start / control_rate_hz, end / control_rate_hz, color=_UNUSED, alpha=0.6, linewidth=0)
     axes.fill_between(seconds, strip.speed, color=BLUE, alpha=0.25, linewidth=0)
     axes.plot(seconds, strip.speed, color=BLUE, linewidth=1)
-    if strip.closedness is not None:
-        axes.plot(seconds, strip.closedness * max_speed, color=ORANGE, linewidth=1.2)
+    if strip.gripper_position is not None:
+        axes.plot(seconds, strip.gripper_position * max_speed, color=ORANGE, linewidth=1.2)
     axes.set(xlim=(0, len(strip.speed) / control_rate_hz), ylim=(0, max_speed * 1.04))
     axes.locator_params(axis="x", nbins=14)
     axes.set_yticks([0, round(max_speed / _SPEED_MARGIN)])

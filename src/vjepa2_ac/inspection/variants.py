@@ -39,7 +39,7 @@ from vjepa2_ac.storage.structured import to_plain
 
 Encode = Callable[[Batch], LatentBatch]  # encodes pixels into latents, on the model's device
 
-_MARGIN = 2.0  # required half-widths of the 95 % interval, because the best of several variants is selected
+_MARGIN = 2.0  # required distance from 0 in half-widths of the 95 % interval, because the best of several is selected
 _MIN_EPISODES_FOR_INTERVAL = 2
 _MIN_EPISODES_TO_BE_CERTAIN = 10  # intervals from fewer episodes are too narrow
 
@@ -87,7 +87,7 @@ VariantErrors = dict[tuple[str, int], Float[np.ndarray, " 2"]]
 def compute_result(
     errors: VariantErrors, name: str, *, reference: VariantErrors | None = None, repair: str = ""
 ) -> VariantResult:
-    """Compute the result of a variant from its errors; the difference is that from `reference` on common clips."""
+    """Compute the result of a variant from its errors; `difference` is relative to `reference`, on common clips."""
     ids, difference = [episode for episode, _ in errors], None
     if reference is not None:
         common = [clip for clip in errors if clip in reference]
@@ -122,7 +122,7 @@ def measure_variants(
         progress: Called with the number of measured clips and the total number, over all variants.
 
     Raises:
-        InputError: A clip cannot be read, or no clip can be read although `data.broken_episodes` skips broken ones.
+        InputError: A clip cannot be read, or no clip remains because `data.broken_episodes` skips all episodes.
     """
     first, num_measured, dataset, windows = variants[0], 0, clips.dataset, clips.windows
     errors_by_variant: list[VariantErrors] = [{} for _ in variants]
@@ -195,7 +195,9 @@ def load_named(config: Config, dataset: Dataset, model: str | None) -> WorldMode
     """
     if model is None and config.model.is_random:
         needed = "a trained model, because the stride is selected by its error"
-        fix = "Set data.stride to a number, or set model.base to a trained model (data calibrate: --model)"
+        fix = (
+            "Set data.stride to a number, or set model.base to a trained model (data calibrate: pass one with --model)"
+        )
         raise InputError(where="model.base: random", found="a random model", needed=needed, fix=fix)
     if model is None:
         loaded = load_base(config.model, seed=config.seed)
@@ -232,7 +234,7 @@ class Calibration:
         return self.best.is_certainly_better(min_episodes=_MIN_EPISODES_TO_BE_CERTAIN)
 
     def verdict(self) -> str:
-        """Return the sentences with the best stride, and whether it is certain."""
+        """Return a text that names the best stride and states whether it is certain."""
         best, difference = self.best, self.best.difference
         seconds = self.stride / self.rate_hz
         text = (
@@ -245,7 +247,7 @@ class Calibration:
             if difference.has_interval:
                 text += f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})"
             if not self.is_certain:
-                text += f", not significant with {counted(best.episodes, 'episode')}; measure more episodes"
+                text += f", uncertain with {counted(best.episodes, 'episode')}; measure more episodes"
         if best.ratio.value >= 1:
             return f"{text}. The model is not better than persistence at any stride. Check that it fits these data."
         return f"{text}."

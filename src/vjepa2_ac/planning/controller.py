@@ -88,7 +88,7 @@ class Controller:
     Example:
         >>> controller = Controller(load_model("builtin:sim-tiny"))  # for a run: Controller.of_run(load_run(FOLDER))
         >>> controller.reset(goal)  # height x width x 3, uint8, RGB
-        >>> action = controller.act(image, state)  # 7 numbers: metres, radians, closedness
+        >>> action = controller.act(image, state)  # 7 numbers: metres, radians, gripper position
     """
 
     def __init__(

@@ -18,8 +18,8 @@ from vjepa2_ac.planning.search_space import GRIPPER
 from vjepa2_ac.spaces import POSE_CHANGE
 
 STEP_M, GRIPPER_STEP = 0.05, 0.75
-"""Size of a named action in one model step, in metres and in closedness, as upstream's planning limits. Predictions are
-unreliable if the training data contain only smaller motions."""
+"""Size of a named action in one model step, in metres and in gripper position, as upstream's planning limits.
+Predictions are unreliable if the training data contain only smaller motions."""
 
 _DIRECTIONS: dict[str, tuple[int, float]] = {  # in the robot base frame: x to the front, y to the left, z up
     "up": (2, 1.0), "down": (2, -1.0),
@@ -28,7 +28,7 @@ _DIRECTIONS: dict[str, tuple[int, float]] = {  # in the robot base frame: x to t
     "open": (6, -1.0), "close": (6, 1.0),
 }  # fmt: skip
 ACTION_NAMES = ("none", *_DIRECTIONS)
-_MAX_ACTION = np.array([1.0] * 3 + [np.pi] * 3 + [1.0])  # metres, radians, closedness; larger: wrong units
+_MAX_ACTION = np.array([1.0] * 3 + [np.pi] * 3 + [1.0])  # metres, radians, gripper position; larger: wrong units
 
 
 def make_named_actions(
@@ -87,11 +87,11 @@ def read_actions(path: str | Path, *, steps: int | None = None) -> Float[np.ndar
         steps: Number of actions to return; None: all. Additional rows of the file are ignored.
 
     Raises:
-        InputError: The file cannot be read, a row does not have 7 finite numbers in metres, radians and closedness, or
-            there are too few rows.
+        InputError: The file cannot be read, a row does not have 7 finite numbers in metres, radians and gripper
+            position, or there are too few rows.
     """
     needed = f"one line of {ACTION_DIM} numbers for each model step: {', '.join(POSE_CHANGE.names)}"
-    fix = "Use metres, radians and closedness changes from -1 to 1, in a NumPy .npy file or a comma-separated .csv file"
+    fix = "Use metres, radians and gripper changes from -1 to 1, in a NumPy .npy file or a comma-separated .csv file"
     invalid_file = partial(InputError, where=str(path), needed=needed, fix=fix)
     try:
         if str(path).lower().endswith(".npy"):

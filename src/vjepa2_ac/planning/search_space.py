@@ -14,7 +14,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import StateSpace
 
 GRIPPER = 6  # of a pose
-GRIPPER_ROUNDING = 0.25  # smaller changes of closedness become zero
+GRIPPER_ROUNDING = 0.25  # smaller changes of gripper position become zero
 _ROUNDING = 4 * torch.finfo(torch.float32).eps  # margin for the rounding errors of a norm
 
 

@@ -1,6 +1,6 @@
 """Offline comparison of policies: the energy of their action chunks at frames of held-out episodes.
 
-The goal of a chunk is the demonstration's frame the same number of model steps later. A policy that imitates the
+The goal of a chunk of N model steps is the demonstration's frame N model steps later. A policy that imitates the
 demonstration therefore scores well. The score does not show whether a policy finds a better solution.
 """
 
@@ -30,7 +30,10 @@ from vjepa2_ac.storage.structured import to_plain
 
 CHANCE = 0.5  # share of other actions with a lower energy than the true ones, if a model ignores the actions
 _NUM_ALTERNATIVES = 16  # number of actions from other evaluation points that the true actions are compared with
-_NEEDED = "arrays `episodes` (names), `frames` (control steps) and `chunks` (points x chunks x control steps x numbers)"
+_NEEDED = (
+    "arrays `episodes` (names), `frames` (control steps)"
+    " and `chunks` (evaluation points x chunks x control steps x components of an action)"
+)
 
 ChunkForm = Literal["targets", "deltas", "offsets"]
 """targets: absolute target states, one after another. deltas: the change from each target to the next. offsets: the
@@ -105,13 +108,13 @@ def changes_of_chunks(
     control_steps: int,
     space: StateSpace = POSE,
 ) -> Float[np.ndarray, "chunks model_steps dim"]:
-    """Convert action chunks to changes of the state in each model step, the actions of the planner.
+    """Convert action chunks to changes of the state in each model step, which are the actions of the planner.
 
     Rotations act on the left (R' = R_delta @ R), as in `vjepa2_ac.episode`. Control steps at the end that do not fill a
     model step are left out.
 
     Args:
-        chunks: Actions of the policy, chunks x control steps x dim: poses in metres, radians and closedness, or
+        chunks: Actions of the policy, chunks x control steps x dim: poses in metres, radians and gripper position, or
             vectors.
         state: The current state of the robot.
         form: Meaning of the numbers.

@@ -192,7 +192,7 @@ def _draw_slices(part: Any, result: PlanResult) -> None:
 
 
 def plot_goals(demonstration: DemonstrationGoals, path: Path) -> Path:
-    """Write the images of all goals and the gripper's closedness as a PNG file, atomically."""
+    """Write the images of all goals and the gripper position as a PNG file, atomically."""
     images = [demonstration.first, *(goal.image for goal in demonstration.goals)]
     rows = -(-len(images) // _IMAGES_PER_ROW)
     states = demonstration.states

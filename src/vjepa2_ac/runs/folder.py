@@ -3,7 +3,7 @@
 RUN/config.yaml         the resolved config, including defaults and a calibrated stride
 RUN/environment.json    versions, machine, command and working directory of every start
 RUN/calibration.json    metrics of each stride, if data.stride was auto
-RUN/changes.json        99th percentile of the change of states per model step, for the value `data` in planning.limits
+RUN/changes.json        99th percentile of state changes per model step, for the value `data` in planning.limits
 RUN/run_id              the unique id of the run
 RUN/metrics.jsonl       metrics, one JSON object per line
 RUN/metrics.json        metrics from `evaluate`, displayed in report.html and evaluation.png
@@ -12,7 +12,7 @@ RUN/tensorboard/        TensorBoard event files
 RUN/wandb/              files of Weights & Biases
 RUN/imagined/           predicted frames at each validation, if `validation.decoder` is set; and videos of `imagine`
 RUN/.mirror/            links to the files that are being uploaded to checkpoint.remote, during the upload
-RUN/.lock               a kernel lock, held by the training process and released when that ends in any way
+RUN/.lock               a kernel lock, held by the training process until it ends, even if it is killed
 """
 
 from __future__ import annotations
@@ -123,7 +123,9 @@ def open_run_folder(config: Config, run_id: str, *, allow_config_change: bool = 
     write_atomically(folder / RUN_ID, run_id)
     (folder / CHECKPOINTS).mkdir(exist_ok=True)
     remove_incomplete(folder / CHECKPOINTS)
-    shutil.rmtree(folder / UPLOAD_LINKS, ignore_errors=True)  # links keep deleted checkpoints on the disk
+    shutil.rmtree(
+        folder / UPLOAD_LINKS, ignore_errors=True
+    )  # with them, deleted checkpoints would still use disk space
     return folder
 
 
@@ -203,10 +205,10 @@ def read_run_config(folder: Path, overrides: Iterable[str] = ()) -> Config:
 
 
 def _resolve_missing_paths(config: Config, folder: Path) -> Iterator[tuple[str, str]]:
-    """Yield key and absolute path of relative paths that exist only from a folder in which the run was started."""
+    """Yield key and absolute path of each missing relative path that exists in an earlier working directory."""
     flat = config_as_flat_dict(config)
     data_sets = zip(("data", "replay.data"), config.data_sets, strict=False)
-    unread = {f"{name}.idle.ranges" for name, data in data_sets if data.is_cache}  # only a part of the cache's key
+    unread = {f"{name}.idle.ranges" for name, data in data_sets if data.is_cache}  # not read from a cache
     starts = [str(start.get("folder")) for start in reversed(_earlier_starts(folder / ENVIRONMENT))]
     for key in _PATHS:
         path = flat.get(key)
@@ -222,7 +224,7 @@ def _resolve_missing_paths(config: Config, folder: Path) -> Iterator[tuple[str, 
 def list_remote_locations(config: Config) -> list[str]:
     """Return a line `key: URL` for each remote location in a config.
 
-    The config of a run may be untrusted, so that its URLs are displayed before they are used.
+    The config of a run may be untrusted. Therefore its URLs are displayed before they are used.
     """
     values = config_as_flat_dict(config).items()
     urls = [f"{key}: {value}" for key, value in values if isinstance(value, str) and is_url(value)]
@@ -260,8 +262,8 @@ def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
 def with_values_of_run(config: Config) -> Config:
     """Return the config with values that the run in its folder has fixed.
 
-    These are the calibrated stride, if the config has auto, and `data.splits`, if the config does not set it: an older
-    run keeps its drawn splits.
+    These are the calibrated stride, if `data.stride` is auto, and `data.splits`, if the config does not set it. So
+    a run of an earlier version keeps the splits that it started with.
     """
     folder = Path(config.run_dir)
     if not (folder / CONFIG).is_file():
@@ -295,8 +297,8 @@ class RunLock:
         On a file system without locks the run continues without one, with a warning.
 
         Raises:
-            InputError: Another process holds the lock (named if it has started training), or the folder is not
-                writable.
+            InputError: Another process holds the lock, or the folder is not writable. The message names the process
+                if it has started training.
         """
         if self._lock.is_locked:
             return

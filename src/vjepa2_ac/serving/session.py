@@ -52,7 +52,9 @@ class SessionOptions:
     image_keys: tuple[str, ...] = IMAGE_KEYS
     deadline_s: float = 60.0  # for a decision, including the encoding of its goal; a late decision is a zero action
     dry_run: bool = False  # whether to plan but send the zero action
-    is_blind: bool = False  # whether the model ranks actions at chance level; `best` of scores is then None
+    is_blind: bool = (
+        False  # whether the model ranks actions at chance level; the field `best` of a reply with scores is then None
+    )
 
 
 @dataclass
@@ -165,7 +167,7 @@ class Session:
             SearchCancelledError: The search was cancelled.
         """
         if request.goal is not None and (fingerprint := request.goal.fingerprint) != self._goal:
-            self._goal, self._notes = None, []  # in case that the new goal is invalid
+            self._goal, self._notes = None, []  # in case the new goal is invalid
             self._set_goal(request.goal, cancelled)
             self._goal = fingerprint
         if request.frame is None or request.state is None:
@@ -233,7 +235,8 @@ class Session:
     def _format_decision(self, decision: Decision | None, state: np.ndarray, why: str) -> dict[str, Any]:
         """Return the reply for a decision. Without a decision, or if it has no plan, the action is zero.
 
-        Only values with one row per action are arrays, because clients take one row of every array.
+        For each action a client takes one row of every array in the reply. So only values with one row per action are
+        arrays.
         """
         planned, changes = np.atleast_2d(state), np.zeros((self.controller.space.steps, self.controller.space.dim))
         reply: dict[str, Any] = {
@@ -288,7 +291,7 @@ class Session:
     def _list_goal_names(self) -> str:
         names = list(self.goals)
         more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-        return f" (this server has {', '.join(names[:_MAX_NAMES])}{more})" if names else ""
+        return f" (the goals of this server are {', '.join(names[:_MAX_NAMES])}{more})" if names else ""
 
     def _count_surprise(self, decision: Decision) -> None:
         if (surprise := decision.surprise) is not None:
@@ -315,8 +318,8 @@ def interpolate_waypoints(
 ) -> Float[np.ndarray, "steps 7"]:
     """Return evenly spaced poses between a state and its target; the last pose is the target.
 
-    A pose is x, y, z in metres, extrinsic xyz angles in radians, and closedness from 0 to 1. The position moves along a
-    straight line. The rotation is about one axis with constant speed.
+    A pose is x, y, z in metres, extrinsic xyz angles in radians, and gripper position from 0 to 1. The position moves
+    along a straight line. The rotation is about one axis with constant speed.
 
     Args:
         state: The measured pose.
@@ -356,7 +359,9 @@ def find_limit_violation(
         return "a translation exceeds planning.limits.xyz or l1"
     if (abs(changes[:, 3:6]) > min(limits.rotation + _ROUNDING, math.pi)).any():
         return "a rotation exceeds planning.limits.rotation"
-    if abs(changes[:, 6]).max() > 1.0:  # the gripper modes open and close use 1, independently of the limit
+    if (
+        abs(changes[:, 6]).max() > 1.0
+    ):  # the gripper modes `open` and `close` command a change of 1, whatever the limit is
         return "a gripper change exceeds 1"
     box, targets = Workspace.from_limits(limits, space), state[:3] + np.cumsum(changes[:, :3], axis=0)
     is_out = box is not None and changes[:, :3].any() and (abs(box.get_return_motion(targets)) > _ROUNDING).any()

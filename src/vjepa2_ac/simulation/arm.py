@@ -67,13 +67,13 @@ class SimulatedArm:
 
     @property
     def state(self) -> State:
-        """Measured pose of the flange, and closedness of the gripper."""
-        return np.append(forward_kinematics(self.joints), self.closedness)
+        """Measured pose of the flange, and gripper position."""
+        return np.append(forward_kinematics(self.joints), self.gripper_position)
 
     @property
-    def closedness(self) -> float:
-        """Measured closedness of the gripper: 0 open .. 1 closed."""
-        return self._closedness
+    def gripper_position(self) -> float:
+        """Measured gripper position: 0 open .. 1 closed."""
+        return self._gripper_position
 
     @property
     def block(self) -> Block | None:
@@ -83,11 +83,11 @@ class SimulatedArm:
     def place(self, block: Block | None, mark: Mark | None) -> None:
         """Set the poses of the block and of the mark. This arm has neither, so the call has no effect."""
 
-    def set_joints(self, joints: Joints, closedness: float, control_steps: int = 1) -> None:
+    def set_joints(self, joints: Joints, gripper_position: float, control_steps: int = 1) -> None:
         """Set the joint angles directly, and advance the moving objects by `control_steps`."""
-        self._closedness = closedness
+        self._gripper_position = gripper_position
         self._data.qpos[:7] = joints
-        self._data.qpos[7:9] = FINGER_TRAVEL_M * (1.0 - closedness)
+        self._data.qpos[7:9] = FINGER_TRAVEL_M * (1.0 - gripper_position)
         self._pass_time(control_steps)
         self._mujoco.mj_kinematics(self._model, self._data)
 
@@ -122,12 +122,14 @@ class SimulatedArm:
         """
         return self.command_joints(self.joints_for(target), float(target[6]), control_steps)
 
-    def command_joints(self, goal: Joints, closedness: float, control_steps: int = 1) -> State:
+    def command_joints(self, goal: Joints, gripper_position: float, control_steps: int = 1) -> State:
         """Move joints (radians) and gripper towards a target for some control steps; return the measured state."""
         remaining = (1.0 - tracking_share(self.domain.lag_s)) ** control_steps  # share of the distance to the target
         grip_remaining = (1.0 - tracking_share(GRIPPER_LAG_S)) ** control_steps
         joints = goal + remaining * (self.joints - goal)
-        self.set_joints(joints, closedness + grip_remaining * (self._closedness - closedness), control_steps)
+        self.set_joints(
+            joints, gripper_position + grip_remaining * (self._gripper_position - gripper_position), control_steps
+        )
         return self.state
 
     def image(self, camera: str | None = None) -> UInt8[np.ndarray, "height width 3"]:
@@ -205,8 +207,8 @@ _ACTUATED, _FINGERS, _BLOCK = slice(0, 9), slice(7, 9), slice(9, 16)  # indices 
 class ContactArm(SimulatedArm):
     """A Franka-like arm that can push and grasp a block. States are measured, in the robot base frame.
 
-    If an object stops the gripper, the measured closedness is that of its real position, as on a real robot. A command
-    to stay at this closedness keeps the gripping force.
+    If an object stops the gripper, the measured gripper position is that of its real position, as on a real robot. A
+    command to stay at this gripper position keeps the gripping force.
 
     Args:
         domain: The world of the arm.
@@ -222,8 +224,8 @@ class ContactArm(SimulatedArm):
         super().__init__(domain, size=size, views=views)
 
     @property
-    def closedness(self) -> float:
-        """Measured closedness of the gripper, from the positions of its fingers."""
+    def gripper_position(self) -> float:
+        """Measured gripper position, from the positions of its fingers."""
         return float(np.clip(1.0 - self._data.qpos[_FINGERS].mean() / FINGER_TRAVEL_M, 0.0, 1.0))
 
     @property
@@ -245,18 +247,18 @@ class ContactArm(SimulatedArm):
             self._data.mocap_pos[0, :2] = base[:2, :2] @ mark
         self._mujoco.mj_kinematics(self._model, self._data)
 
-    def set_joints(self, joints: Joints, closedness: float, control_steps: int = 1) -> None:
+    def set_joints(self, joints: Joints, gripper_position: float, control_steps: int = 1) -> None:
         """Set the joint angles directly, at rest; a grasped object is released."""
-        super().set_joints(joints, closedness, control_steps)
+        super().set_joints(joints, gripper_position, control_steps)
         self._data.qvel[_ACTUATED] = 0.0
         self._data.qacc_warmstart[:] = 0.0
         self._setpoint = self._data.qpos[_ACTUATED].copy()
-        self._grip = closedness
+        self._grip = gripper_position
 
-    def command_joints(self, goal: Joints, closedness: float, control_steps: int = 1) -> State:
+    def command_joints(self, goal: Joints, gripper_position: float, control_steps: int = 1) -> State:
         """Move joints (radians) and gripper towards a target for some control steps; return the measured state."""
-        if abs(closedness - self.closedness) > _MIN_GRIP_CHANGE:
-            self._grip = closedness
+        if abs(gripper_position - self.gripper_position) > _MIN_GRIP_CHANGE:
+            self._grip = gripper_position
         target = np.append(goal, [FINGER_TRAVEL_M * (1.0 - self._grip)] * 2)
         for _ in range(control_steps * SUBSTEPS):
             change = self._tracking_share * (target - self._setpoint)

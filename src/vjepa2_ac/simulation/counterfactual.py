@@ -29,7 +29,7 @@ RECORDED_CAMERAS = {"exterior_1_left": "exterior_1", "exterior_2_left": "exterio
 """Camera of a data set, as in `data.fields.cameras` -> camera of the simulated arm."""
 
 _CACHE_SIZE = 4  # number of cached resimulations of `explore`, each with another start
-# Metres, radians, closedness. Recorded states are float32, and library versions round differently.
+# Metres, radians, gripper position. Recorded states are float32, and library versions round differently.
 _STATE_TOLERANCE = 1e-5
 
 Actions = tuple[tuple[float, ...], ...]

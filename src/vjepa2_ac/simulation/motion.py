@@ -154,7 +154,7 @@ class Motion:
     """Commands and measurements of every control step; poses are in the robot base frame."""
 
     commanded_joints: Float[np.ndarray, "steps 7"]
-    commanded_gripper: Float[np.ndarray, " steps"]  # closedness: 0 open .. 1 closed
+    commanded_gripper: Float[np.ndarray, " steps"]  # gripper position: 0 open .. 1 closed
     joints: Float[np.ndarray, "steps 7"]
     gripper: Float[np.ndarray, " steps"]
 
@@ -237,7 +237,7 @@ def follow(commands: Float[np.ndarray, "steps_and_one dim"], share: float) -> Fl
 def _waypoints(
     segments: int, rng: np.random.Generator, recipe: MotionRecipe
 ) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
-    """Return waypoints: positions, rotations about the vertical, closedness. Steps out of the box are reversed."""
+    """Return positions, rotations about the vertical, gripper positions. Steps out of the box are reversed."""
     low, high = np.append(recipe.low_m, -recipe.max_turn_rad), np.append(recipe.high_m, recipe.max_turn_rad)
     drift = np.append(recipe.drift_m or np.zeros(3), 0.0)
     reach = np.append(0.3 * drift[:3] if recipe.drift_m else [recipe.reach_m] * 3, recipe.turn_rad)

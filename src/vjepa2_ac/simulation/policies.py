@@ -257,7 +257,7 @@ def play(
                 action = _play_action(arm, problem, limits, rng)
             joints, grip = _command_of(arm, action)
         motion.commanded_joints[step], motion.commanded_gripper[step] = joints, grip
-        motion.joints[step], motion.gripper[step] = arm.joints, arm.closedness
+        motion.joints[step], motion.gripper[step] = arm.joints, arm.gripper_position
         if on_step:
             on_step(arm)
         arm.command_joints(joints, grip)
@@ -287,7 +287,7 @@ def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, 
 
 
 def _command_of(arm: SimulatedArm, action: Float[np.ndarray, " 7"]) -> tuple[np.ndarray, float]:
-    """Return the commanded joints and closedness for an action, or for its largest reachable part."""
+    """Return the commanded joints and gripper position for an action, or for its largest reachable part."""
     joints, target = arm.joints, apply_action(arm.state, action)
     for state in [target, *reversed(states_along(arm.state, action)[:-1])]:
         with suppress(OutOfReachError):

@@ -108,8 +108,8 @@ def execute_episode(
     arm.reset_clock()
     motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)
     measured = slice(None if until is None else until + 1)
-    for joints, closedness in zip(motion.joints[measured], motion.gripper[measured], strict=True):
-        arm.set_joints(joints, float(closedness))
+    for joints, gripper_position in zip(motion.joints[measured], motion.gripper[measured], strict=True):
+        arm.set_joints(joints, float(gripper_position))
         if on_step:
             on_step(arm)
     return motion

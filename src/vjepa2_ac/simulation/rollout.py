@@ -30,7 +30,7 @@ _NUM_PARTS = 8  # number of parts into which an unreachable displacement is divi
 class Trial:
     """One attempt at a task: its start, its goal, and the number of steps."""
 
-    seed: int  # seed of the environment's reset, which is the number of the problem
+    seed: int  # seed for the reset of the environment; it equals the number of the problem
     steps: int  # number of model steps
     stride: int  # control steps per model step
     problem: TaskProblem | None = None  # start and goal of the simulated arm; None: the seed determines them
@@ -44,7 +44,7 @@ class Observation(NamedTuple):
     image: Image
     state: State  # measured
     block: Block | None = None  # None: the task has none, or it is not measured
-    joints: Float[np.ndarray, " 8"] | None = None  # joint angles and closedness; None: not measured
+    joints: Float[np.ndarray, " 8"] | None = None  # joint angles and gripper position; None: not measured
 
 
 class Environment(Protocol):
@@ -66,12 +66,12 @@ class Environment(Protocol):
         """Carry out an action for a model step.
 
         Args:
-            action: The change of the flange's pose (conventions: episode.py), or of joint angles and closedness; None:
-                the environment's expert acts.
+            action: The change of the flange's pose (conventions: episode.py), or of joint angles and gripper position;
+                None: the environment's expert acts.
 
         Returns:
-            Observation, reward, terminated, truncated, and a dictionary as for `reset`, in addition with `target` (the
-            commanded pose) or `is_reachable` (whether the arm could carry out the action).
+            Observation, reward, terminated, truncated, and a dictionary as for `reset` that also contains `target`
+            (the commanded pose) or `is_reachable` (whether the arm could carry out the action), or both.
         """
 
 
@@ -79,7 +79,7 @@ class Policy(Protocol):
     """Selects the action of the next model step."""
 
     name: str
-    why: str  # reason for the last action, one of few texts, so that reasons can be counted
+    why: str  # reason for the last action, from a small set, so that reasons can be counted
 
     def reset(self, trial: Trial, goal_image: Image) -> None:
         """Start an episode. Only an oracle uses more of the trial than its images."""
@@ -239,8 +239,8 @@ class ArmEnvironment:
         else:
             target = self.arm.joints + action[:-1]
             joints = np.clip(target, LOW, HIGH)
-            closedness = float(np.clip(self.arm.closedness + action[-1], 0.0, 1.0))
-            self.arm.command_joints(joints, closedness, self._stride)
+            gripper_position = float(np.clip(self.arm.gripper_position + action[-1], 0.0, 1.0))
+            self.arm.command_joints(joints, gripper_position, self._stride)
             is_reachable = bool(np.array_equal(target, joints))
         observation, info = self._observe()
         return observation, -info["distance_m"], info["success"], False, info | {"is_reachable": is_reachable}
@@ -249,7 +249,7 @@ class ArmEnvironment:
         arm, problem = self.arm, self._problem
         state, block = arm.state, arm.block
         info = {"distance_m": problem.distance_m(state, block), "success": problem.succeeded(state, block)}
-        joints = np.append(arm.joints, arm.closedness)
+        joints = np.append(arm.joints, arm.gripper_position)
         return Observation(arm.image(), state, None if problem.block_goal is None else block, joints), info
 
 
@@ -266,7 +266,7 @@ def set_scene(arm: SimulatedArm, state: State, block: Block | None, mark: Mark |
 
 
 def send_action(arm: SimulatedArm, action: State, stride: int) -> bool:
-    """Command the state after an action for `stride` control steps; return whether the arm can reach it.
+    """Command the state to which an action leads, for `stride` control steps; return whether the arm can reach it.
 
     The target is relative to the *measured* state. If the arm cannot reach it, the arm moves as far as possible along
     the straight line to it.
@@ -284,7 +284,7 @@ def send_action(arm: SimulatedArm, action: State, stride: int) -> bool:
 
 
 def target_state(state: State, action: State) -> State:
-    """Return the state after an action, with its closedness clipped to 0 .. 1."""
+    """Return the state after an action, with its gripper position clipped to 0 .. 1."""
     target = np.asarray(apply_action(state, action))
     target[6] = np.clip(target[6], 0.0, 1.0)
     return target

@@ -42,9 +42,9 @@ REACH_DISTANCE_M, PUSH_DISTANCE_M, LIFT_M, PLACE_DISTANCE_M = (0.12, 0.25), (0.1
 
 GRASP_M = FINGERTIP_M - 0.02  # height of the flange above the centre of the block when grasping it
 
-HOLDING = 1.0 - (BLOCK_M / 2 - FINGER_INSIDE_M) / FINGER_TRAVEL_M  # closedness of a gripper that holds the block
+HOLDING = 1.0 - (BLOCK_M / 2 - FINGER_INSIDE_M) / FINGER_TRAVEL_M  # gripper position that holds the block
 
-RELEASED = HOLDING - 0.1  # closedness below which the block is released, with 4 mm of space on each side
+RELEASED = HOLDING - 0.1  # gripper position below which the block is released, with 4 mm of space on each side
 
 _FLANGE_AREA = np.array([[0.32, -0.26], [0.62, 0.26]])  # lower and upper bounds of (x, y) in the world
 _BLOCK_AREA = np.array([[0.36, -0.26], [0.64, 0.26]])
@@ -128,7 +128,7 @@ def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskP
     """
     problem = _DRAW_PROBLEM[task](np.random.default_rng([seed, index, list(_DRAW_PROBLEM).index(task)]))
     poses = poses_in_base(downward_poses(_append(problem.flange, problem.turn)), domain)
-    first, last = np.concatenate([poses, np.array(problem.closedness)[:, None]], axis=1)
+    first, last = np.concatenate([poses, np.array(problem.gripper_position)[:, None]], axis=1)
     if problem.blocks is None:
         return TaskProblem(task, index, first, last)
     turns = problem.blocks[:, 3:] - np.deg2rad(domain.base_yaw_deg)
@@ -142,7 +142,7 @@ class _WorldProblem:
 
     flange: Float[np.ndarray, "2 3"]
     turn: float  # rotation of the hand about the vertical, at start and goal
-    closedness: tuple[float, float]
+    gripper_position: tuple[float, float]
     blocks: Float[np.ndarray, "2 4"] | None = None
 
 
@@ -152,8 +152,8 @@ def _draw_reach(rng: np.random.Generator) -> _WorldProblem:
     start = rng.uniform(low, high)
     while not REACH_DISTANCE_M[0] <= np.linalg.norm((goal := rng.uniform(low, high)) - start) <= REACH_DISTANCE_M[1]:
         pass
-    turn, closedness = rng.uniform(-recipe.max_turn_rad, recipe.max_turn_rad), float(rng.integers(2))
-    return _WorldProblem(np.stack([start, goal]), turn, (closedness, closedness))
+    turn, gripper_position = rng.uniform(-recipe.max_turn_rad, recipe.max_turn_rad), float(rng.integers(2))
+    return _WorldProblem(np.stack([start, goal]), turn, (gripper_position, gripper_position))
 
 
 def _draw_push(rng: np.random.Generator) -> _WorldProblem:

@@ -1,8 +1,8 @@
 """Files on this machine and behind URLs: find, read and hash them; write local files atomically.
 
-A path is local, or a URL such as `gs://bucket/folder` (see `remote`). A missing or truncated file raises an
-`InputError`, so an episode with such a file counts as broken. Network failures are retried and finally raise an
-`UnreachableError`, as do errors of the operating system (see `read_error`); the file itself may be intact.
+A path is local, or a URL such as `gs://bucket/folder` (see `remote`). An episode with a missing or truncated file
+counts as broken. Network failures are retried, and finally raise an `UnreachableError`. Other errors of the operating
+system raise it at once (see `read_error`). The file itself may then be intact.
 
 A file is written under a temporary name, `.NAME.RANDOM.partial` in the target folder, and renamed when it is complete
 and on the disk. A later writer removes partial files of killed writers after one day.
@@ -124,7 +124,7 @@ def list_names(folder: str | Path) -> list[str]:
 
 
 def require_regular_file(path: str | Path, size: int | None = None) -> None:
-    """Refuse a git-lfs pointer, a pipe or a device in place of a file. Only small files are read.
+    """Refuse a git-lfs pointer, a pipe or a device in place of a file. Of large files nothing is read.
 
     Args:
         path: The file, which may be missing.
@@ -162,7 +162,7 @@ def open_for_reading(path: str | Path) -> ByteReader:
 def read_error(where: str, error: OSError, *, needed: str = "", fix: str = "") -> UserError:
     """Return the error of a file that is missing, truncated, or refused by the operating system.
 
-    A missing file is a MissingFileError, a truncated one an InputError. After a refusal (no
+    For a missing file the error is a MissingFileError, and for a truncated file an InputError. After a refusal (no
     permission, too many open files, a disconnected disk) the file may be intact. The error is then an UnreachableError,
     for which a file is never removed, replaced or recorded as broken. Missing permission is a RefusedError, with the
     mode and the owner of the file.
@@ -284,7 +284,7 @@ def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
     target = Path(path)
     temporary = _new_partial(target.parent, target.name)
     try:
-        with temporary.open("xb") as file:  # opened by name, which some libraries need to choose the format
+        with temporary.open("xb") as file:  # opened by name: some libraries choose the format from `file.name`
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -423,7 +423,7 @@ def _new_partial(parent: Path, name: str) -> Path:
 
 @functools.cache
 def remove_abandoned(folder: Path) -> None:
-    """Remove partial files that are unchanged for a day from a folder. Files that cannot be removed are skipped.
+    """Remove from a folder the partial files that have not changed for a day. Files that cannot be removed are skipped.
 
     Each process scans a folder only once, because it may contain thousands of files.
     """

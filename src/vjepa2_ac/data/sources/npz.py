@@ -3,7 +3,7 @@
 An episode NAME.npz, as numpy.savez or numpy.savez_compressed writes it, holds
 
     states             [steps, 7]  measured: x, y, z in metres, roll, pitch, yaw in radians (extrinsic xyz Euler),
-                                   gripper closedness, 0 open .. 1 closed; all in the robot's base frame
+                                   gripper position, 0 open .. 1 closed; all in the robot's base frame
                                    ([steps, any] with data.states: vector: any numbers)
     frames             [steps, height, width, 3] uint8, RGB: the frame at each step
     fps_hz             control steps per second, the same in all episodes
