@@ -1,12 +1,14 @@
-"""Run the missing measurements of both studies, and write docs/evidence.md with its plots.
+"""Run the missing measurements of the three studies, and write docs/evidence.md with its plots.
 
     python evidence --table                     # write tables and plots from results/*.json (make evidence)
     python evidence --only look --seeds 1       # run a part of the methods study; finished cells are skipped
     python evidence --study selection           # measure every checkpoint of 21 runs in closed loop
+    python evidence --study labs                # adapt to twelve random labs
 
 The methods study compares methods that adapt a base model to a changed scene. The selection study compares metrics that
-select a checkpoint. A finished measurement is a JSON file in the work folder; the values that the tables need are
-written to evidence/results.
+select a checkpoint. The labs study asks whether adapting helps in a new lab, and whether the advice of the tool is
+good. A finished measurement is a JSON file in the work folder; the values that the tables need are written to
+evidence/results.
 """
 
 from __future__ import annotations
@@ -30,32 +32,38 @@ def main() -> int:
     options = _parse()
     failed = 0
     if not options.table:
-        failed = (_run_methods if options.study == "methods" else _run_selection)(options)
+        failed = STUDIES[options.study](options)
     write(options.folder)
     return 1 if failed else 0
 
 
 def write(folder: Path) -> None:
     """Write the results, tables and plots of all measurements."""
+    import labs
+    import labs_tables
     import results
     import selection
     import selection_tables
     import tables
 
-    kept, docs = results.KEPT, ROOT / "docs"
-    of_methods = results.read_all(folder / "methods", kept / "methods.json", results.compact, results.name_of)
-    results.write_all(kept / "methods.json", of_methods)
-    tables.write_tables(of_methods, kept / "methods.md", docs / "evidence.md")
-    tables.draw(of_methods, docs / "evidence.png")
-    of_selection = results.read_all(folder / "selection", kept / "selection.json", selection.compact, selection.name_of)
-    results.write_all(kept / "selection.json", of_selection)
-    selection_tables.write_tables(of_selection, kept / "selection.md", docs / "ranking.png")
-    print(f"docs/evidence.md and evidence/results: {len(of_methods)} cells, {len(of_selection)} checkpoints")
+    stored, docs = results.RESULTS, ROOT / "docs"
+    counts = []
+    for study, compact, name_of, write_tables in (
+        ("methods", results.compact, results.name_of, tables.write_tables),
+        ("selection", selection.compact, selection.name_of, selection_tables.write_tables),
+        ("labs", labs.compact, labs.name_of, labs_tables.write_tables),
+    ):
+        measured = results.read_all(folder / study, stored / f"{study}.json", compact, name_of)
+        if measured:
+            results.write_all(stored / f"{study}.json", measured)
+        write_tables(measured, stored / f"{study}.md", docs)
+        counts.append(f"{study} {len(measured)}")
+    print(f"docs/evidence.md and evidence/results: {', '.join(counts)} measurements")
 
 
 def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--study", choices=("methods", "selection"), default="methods")
+    parser.add_argument("--study", choices=tuple(STUDIES), default="methods")
     parser.add_argument(
         "--folder", type=Path, default=Path("build/evidence"), help="work folder: data, base models, runs, measurements"
     )
@@ -78,9 +86,9 @@ def _run_methods(options: argparse.Namespace) -> int:
     from measure import measure
     from methods import all_cells
     from prepare import prepare
-    from results import KEPT, name_of
+    from results import RESULTS, name_of
 
-    cells = _missing(list(all_cells(options.seeds)), KEPT / "methods.json", name_of, options)
+    cells = _missing(list(all_cells(options.seeds)), RESULTS / "methods.json", name_of, options)
     absent = {cell.shift for cell in cells if cell.shift in TASKS and not TASKS[cell.shift].is_installed}
     for task in sorted(absent):
         fix = f"Run `make worlds/{TASKS[task].program}` (docs/worlds.md)"
@@ -91,27 +99,41 @@ def _run_methods(options: argparse.Namespace) -> int:
 
 
 def _run_selection(options: argparse.Namespace) -> int:
-    from results import KEPT
+    from results import RESULTS
     from selection import all_cells, measure_alone, name_of, prepare, train_alone
 
-    cells = _missing(list(all_cells(min(options.seeds, 3))), KEPT / "selection.json", name_of, options)
+    cells = _missing(list(all_cells(min(options.seeds, 3))), RESULTS / "selection.json", name_of, options)
     prepare(options.folder)
     runs = list({cell.run.name: cell.run for cell in cells}.values())
     failed = _in_processes(train_alone, [(run, options.folder) for run in runs], options)
     return failed + _in_processes(measure_alone, [(cell, options.folder, options.goals) for cell in cells], options)
 
 
-def _missing(cells: list[Any], kept: Path, name_of: Callable[[Any], str], options: argparse.Namespace) -> list[Any]:
+def _run_labs(options: argparse.Namespace) -> int:
+    from labs import all_cells, lab_of, measure, name_of, prepare
+    from results import RESULTS
+
+    cells = _missing(list(all_cells()), RESULTS / "labs.json", name_of, options)
+    labs = {cell.lab: lab_of(cell.lab) for cell in cells}
+    failed = _in_processes(prepare, [(lab, options.folder) for lab in labs.values()], options)
+    return failed + _in_processes(measure, [(cell, options.folder, options.goals) for cell in cells], options)
+
+
+STUDIES = {"methods": _run_methods, "selection": _run_selection, "labs": _run_labs}
+
+
+def _missing(cells: list[Any], stored: Path, name_of: Callable[[Any], str], options: argparse.Namespace) -> list[Any]:
     """Return the cells without a measurement."""
     (options.folder / options.study).mkdir(parents=True, exist_ok=True)
     known = {path.stem for path in (options.folder / options.study).glob("*.json")}
-    known |= {name_of(one) for one in json.loads(kept.read_text())}
+    if stored.exists():
+        known |= {name_of(result) for result in json.loads(stored.read_text())}
     missing = [cell for cell in cells if options.only in cell.name and cell.name not in known]
     print(f"measuring {len(missing)} of {len(cells)} cells", flush=True)
     return missing
 
 
-def _in_processes(do: Callable[..., Any], work: Sequence[tuple[Any, ...]], options: argparse.Namespace) -> int:
+def _in_processes(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], options: argparse.Namespace) -> int:
     """Run each call in a new process and write its result; return the number of failed calls.
 
     Raises:
@@ -120,11 +142,11 @@ def _in_processes(do: Callable[..., Any], work: Sequence[tuple[Any, ...]], optio
     os.environ["OMP_NUM_THREADS"] = "1"
     context, failed = multiprocessing.get_context("spawn"), 0
     with ProcessPoolExecutor(options.workers, mp_context=context, max_tasks_per_child=1) as pool:
-        waiting = {pool.submit(do, *one): one[0] for one in work}
-        for number, done in enumerate(as_completed(waiting), start=1):
-            name = waiting[done].name
+        futures = {pool.submit(function, *arguments): arguments[0] for arguments in calls}
+        for number, future in enumerate(as_completed(futures), start=1):
+            name = futures[future].name
             try:
-                result = done.result()
+                result = future.result()
             except BrokenProcessPool:
                 raise
             except Exception as error:  # the other cells continue
@@ -135,7 +157,7 @@ def _in_processes(do: Callable[..., Any], work: Sequence[tuple[Any, ...]], optio
                 path = options.folder / options.study / f"{name}.json"
                 path.with_suffix(".part").write_text(json.dumps(result, indent=1))
                 path.with_suffix(".part").rename(path)
-            print(f"{number}/{len(waiting)} {name}", flush=True)
+            print(f"{number}/{len(futures)} {name}", flush=True)
     return failed
 
 

@@ -16,22 +16,22 @@ from vjepa2_ac.simulation.rollout import ClosedLoopResult, Policy, Trials, run_t
 from vjepa2_ac.simulation.worlds import ExternalEnvironment, find_trials, record_world
 
 ROOT = Path(__file__).resolve().parents[1]
-STRIDE, EVERY = 4, 2  # control steps of a model step, and from one recorded frame to the next
+STRIDE, EVERY = 4, 2  # control steps per model step, and per recorded frame
 SIZE = 96  # pixels: those of the tiny encoder
-EPISODES_BEFORE, EPISODES_AFTER = 120, 60  # recorded in the world before and after its change
-EPISODES_LIFT = 150  # after the change: Lift is learned from 5 and 80 demonstrations, too
+EPISODES_BEFORE, EPISODES_AFTER = 120, 60  # recorded before and after the change
+EPISODES_LIFT = 150  # after the change; Lift is also trained on 5 and 80 demonstrations
 CHANGED = ("--camera", "40", "--mount", "20", "--look", "dusk")  # robosuite: another camera, mounting and light
 FIRST = {"before": 0, "after": 10_000}  # seed of the recordings
 
 
 @dataclass(frozen=True)
 class Task:
-    """A task of a world, before and after a change of it."""
+    """A task of a third-party environment, before and after a change."""
 
-    program: str  # in examples/worlds, and the name of its environment
+    program: str  # name of the program in examples/worlds, and of its virtual environment
     before: tuple[str, ...]
     after: tuple[str, ...]
-    origin: str | None = None  # the task with the same world before the change and the same base model
+    origin: str | None = None  # the task with the same recordings before the change and the same base model
     seeds: int = 1  # one seed suffices for a task that no method solves
 
     @property
@@ -44,7 +44,7 @@ class Task:
         return ROOT / "worlds" / self.program / "bin" / "python"
 
     def command(self, when: str) -> str:
-        """Return the command that starts the world."""
+        """Return the command that starts the environment."""
         words = self.before if when == "before" else self.after
         program = ROOT / "examples" / "worlds" / f"{self.program}.py"
         return shlex.join([str(self._python), str(program), *words, "--size", str(SIZE)])
@@ -60,7 +60,7 @@ TASKS = {
 
 
 def origin_of(task: str) -> str:
-    """Return the task whose world before the change and base model this task uses."""
+    """Return the task whose recordings before the change and base model this task uses."""
     return TASKS[task].origin or task
 
 
@@ -77,8 +77,8 @@ def data_of(folder: Path, task: str, when: str) -> DataConfig:
 
 def record(folder: Path, task: str, when: str) -> None:
     """Record the missing demonstrations of a task."""
-    of_after = EPISODES_LIFT if task == "Lift" else EPISODES_AFTER
-    first, count = FIRST[when], EPISODES_BEFORE if when == "before" else of_after
+    num_after = EPISODES_LIFT if task == "Lift" else EPISODES_AFTER
+    first, count = FIRST[when], EPISODES_BEFORE if when == "before" else num_after
     path = Path(data_of(folder, task, when).path)
     if len(list(path.glob("*.npz"))) < count:
         print(f"recording {path}", flush=True)
@@ -88,16 +88,16 @@ def record(folder: Path, task: str, when: str) -> None:
 
 def problems(folder: Path, task: str, seed: int, goals: int, when: str = "after") -> tuple[Trials, ClosedLoopResult]:
     """Return the problems, with a goal for each model step; they are stored, because the expert is slow."""
-    word = "-before" if when == "before" else ""
-    path = folder / "problems" / f"{task}{word}-{seed}-{goals}.pickle"
+    suffix = "-before" if when == "before" else ""
+    path = folder / "problems" / f"{task}{suffix}-{seed}-{goals}.pickle"
     if not path.exists():
         options = BenchmarkOptions(episodes=goals, seed=seed, sub_goals="every-step")
         with ExternalEnvironment(TASKS[task].command(when)) as world:
-            found = find_trials(world, options, STRIDE)
+            trials_and_expert = find_trials(world, options, STRIDE)
         path.parent.mkdir(exist_ok=True)
-        path.with_suffix(".part").write_bytes(pickle.dumps(found))
+        path.with_suffix(".part").write_bytes(pickle.dumps(trials_and_expert))
         path.with_suffix(".part").rename(path)
-    return pickle.loads(path.read_bytes())  # type: ignore[no-any-return]  # noqa: S301 - our own
+    return pickle.loads(path.read_bytes())  # type: ignore[no-any-return]  # noqa: S301 - written by this program
 
 
 def closed_loop(
@@ -106,10 +106,10 @@ def closed_loop(
     """Return the results of a policy on the expert's problems, before or after the change."""
     trials, expert = problems(folder, task, seed, goals, when)
     with ExternalEnvironment(TASKS[task].command(when)) as world:
-        return figures_of(run_trials(world, policy, trials), expert)
+        return summarize(run_trials(world, policy, trials), expert)
 
 
-def figures_of(result: ClosedLoopResult, expert: ClosedLoopResult) -> dict[str, Any]:
+def summarize(result: ClosedLoopResult, expert: ClosedLoopResult) -> dict[str, Any]:
     """Return the objects' distances to goals and the hand's final distance to the expert's (cm), and the successes."""
     ends = [np.stack([episode.states[-1, :3] for episode in each.episodes]) for each in (result, expert)]
     return {

@@ -12,9 +12,9 @@ from typing import Any, get_args
 import environments
 import numpy as np
 import torch
-from methods import BEFORE, PLANNING, SHIFTS, Cell, method_of
-from offline import offline_figures
-from prepare import base_model, data_before, data_shifted, encoded, training_episodes
+from methods import BEFORE, PLANNING, SHIFTS, Cell, get_method
+from offline import measure_offline
+from prepare import base_model, data_before, data_shifted, encode_clips, exclude_episodes
 
 from vjepa2_ac.config import Config, ModelConfig, ValidationConfig
 from vjepa2_ac.config.section import Component
@@ -37,38 +37,38 @@ from vjepa2_ac.simulation.rollout import Policy
 from vjepa2_ac.training.cost import count_parameters
 from vjepa2_ac.training.loop import train
 
-TEST_GOALS = 9_000  # first seed of problems, to which a cell adds its own (`goals_seed`)
+TEST_GOALS = 9_000  # first seed of problems, to which a cell adds its own (`get_goals_seed`)
 CLIPS = 128  # of held-out episodes
 
 
 def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Train a cell on one thread and return its metrics; `folder` is the work folder with the output of `prepare`."""
     torch.set_num_threads(1)
-    config, method = config_of(cell, folder), method_of(cell.method)
+    config, method = make_config(cell, folder), get_method(cell.method)
     started = time.process_time()
-    figures: dict[str, Any] = {"cell": asdict(cell), "made_with": made_with()}
+    result: dict[str, Any] = {"cell": asdict(cell), "made_with": describe_software()}
     if method.kind == "cloned":
-        prior, figures["held_out"] = _prior(cell, config, folder)
-        figures |= {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": (time.process_time() - started) / 60}
+        prior, result["held_out"] = _prior(cell, config, folder)
+        result |= {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": (time.process_time() - started) / 60}
         model = load_base(config.model, seed=cell.seed)
-        acts = PLANNING.model_copy(update={"planner": Component("prior"), "prior": prior})
-        return figures | {"reach": {"l1": closed_loop(cell, Planning(Controller(model, acts)), folder, goals=goals)}}
+        planning = PLANNING.model_copy(update={"planner": Component("prior"), "prior": prior})
+        return result | {"reach": {"l1": closed_loop(cell, Planning(Controller(model, planning)), folder, goals=goals)}}
     if method.kind == "zero-shot":
         model, trained = load_base(config.model, seed=cell.seed), {"trained_share": 0.0, "adapter_mb": 0.0}
     else:
-        model, trained = _trained(train(config, SILENT))
-    acts = PLANNING.model_copy(update={"prior": _prior(cell, config, folder)[0]}) if method.prior else PLANNING
-    figures |= {**trained, "cpu_minutes": (time.process_time() - started) / 60}
-    batches = encoded(config, model.eval(), "test", CLIPS)
-    figures["shifted"] = _as_dict(prediction_errors(model, batches))
+        model, trained = _load_trained(train(config, SILENT))
+    planning = PLANNING.model_copy(update={"prior": _prior(cell, config, folder)[0]}) if method.prior else PLANNING
+    result |= {**trained, "cpu_minutes": (time.process_time() - started) / 60}
+    batches = encode_clips(config, model.eval(), "test", CLIPS)
+    result["shifted"] = _relative_errors(prediction_errors(model, batches))
     if cell.shift in SHIFTS:
-        figures["offline"] = offline_figures(model, open_dataset(config.data).spaces.action, batches)
+        result["offline"] = measure_offline(model, open_dataset(config.data).spaces.action, batches)
     if model.adaptation is not None:
         merge_adapter(model)
-    figures["reach"] = {"l1": closed_loop(cell, Planning(Controller(model, acts)), folder, goals=goals)}
+    result["reach"] = {"l1": closed_loop(cell, Planning(Controller(model, planning)), folder, goals=goals)}
     if cell.method == "zero-shot":
-        figures["baselines"] = baselines(cell, folder, goals)
-    return figures
+        result["baselines"] = measure_baselines(cell, folder, goals)
+    return result
 
 
 def _prior(cell: Cell, config: Config, folder: Path) -> tuple[str, Mapping[str, Any]]:
@@ -77,22 +77,22 @@ def _prior(cell: Cell, config: Config, folder: Path) -> tuple[str, Mapping[str, 
     return str(path), train_prior(config, path).held_out
 
 
-def made_with() -> dict[str, str]:
+def describe_software() -> dict[str, str]:
     """Return the version of PyTorch and the commit of this checkout."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=7"]
     described = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     return {"torch": torch.__version__, "commit": described.stdout.strip() or "unknown"}
 
 
-def config_of(cell: Cell, folder: Path) -> Config:
+def make_config(cell: Cell, folder: Path) -> Config:
     """Return the config of a cell."""
-    method = method_of(cell.method, cell.shift)
+    method = get_method(cell.method, cell.shift)
     data = (data_before if cell.method == BEFORE else data_shifted)(folder, cell.shift)
-    left_out = training_episodes(data, cell.episodes, cell.seed) if cell.episodes else ()
+    excluded = exclude_episodes(data, cell.episodes, cell.seed) if cell.episodes else ()
     return Config(
         run_dir=str(folder / "runs" / cell.name),
         seed=cell.seed,
-        data=data.model_copy(update={"exclude": left_out}),
+        data=data.model_copy(update={"exclude": excluded}),
         model=ModelConfig(base=base_model(folder, cell.base, cell.seed, cell.shift), dtype="float32"),
         adapter=method.adapter,
         training=method.training,
@@ -101,44 +101,44 @@ def config_of(cell: Cell, folder: Path) -> Config:
     )
 
 
-def goals_seed(cell: Cell) -> int:
+def get_goals_seed(cell: Cell) -> int:
     """Return the seed of a cell's problems; in third-party environments it is the first of several seeds."""
     return TEST_GOALS + (1 if cell.shift in SHIFTS else 100) * cell.seed
 
 
-def baselines(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
+def measure_baselines(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Return the results of policies without a model on the same goals."""
     policies: list[Policy] = [ZeroActions(), RandomActions(PLANNING.limits, cell.seed)]
     policies += [Oracle(PLANNING.limits)] if cell.shift in SHIFTS else []
     result = {policy.name: closed_loop(cell, policy, folder, goals=goals) for policy in policies}
     if cell.shift not in SHIFTS:
-        _, expert = environments.problems(folder, cell.shift, goals_seed(cell), goals)
-        result["oracle"] = environments.figures_of(expert, expert)
+        _, expert = environments.problems(folder, cell.shift, get_goals_seed(cell), goals)
+        result["oracle"] = environments.summarize(expert, expert)
     return result
 
 
 def closed_loop(cell: Cell, policy: Policy, folder: Path, *, goals: int) -> dict[str, Any]:
     """Return the distances to the goal (cm) before the first and after each step, and the solved problems."""
-    seed = goals_seed(cell)
+    seed = get_goals_seed(cell)
     if cell.shift not in SHIFTS:
         when = "before" if cell.method == BEFORE else "after"
         return environments.closed_loop(folder, cell.shift, policy, seed=seed, goals=goals, when=when)
-    results = [run_task(spec, policy) for spec in _rollouts(cell.shift, seed, goals)]
-    return {"distance_cm": np.round(np.concatenate([one.distance_cm for one in results]), 3).tolist()}
+    results = [run_task(spec, policy) for spec in _list_goals(cell.shift, seed, goals)]
+    return {"distance_cm": np.round(np.concatenate([each.distance_cm for each in results]), 3).tolist()}
 
 
-def _rollouts(shift: str, seed: int, goals: int) -> Iterator[BenchmarkOptions]:
+def _list_goals(shift: str, seed: int, goals: int) -> Iterator[BenchmarkOptions]:
     """Yield the goals: all in one world, or each in a new world in which no episode was recorded."""
     world = SHIFTS[shift]
     if isinstance(world, Domain):
         yield BenchmarkOptions("reach", world, goals, seed)
         return
     for goal in range(goals):
-        drawn = sample_domain(np.random.default_rng([seed, goal]), world)
-        yield BenchmarkOptions("reach", drawn, 1, seed * 100 + goal)
+        domain = sample_domain(np.random.default_rng([seed, goal]), world)
+        yield BenchmarkOptions("reach", domain, 1, seed * 100 + goal)
 
 
-def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
+def _load_trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
     loaded = load_subject(run, NEWEST)  # the last checkpoint
     assert loaded.checkpoint is not None, "a run"
     counts = count_parameters(loaded.config, loaded.world_model.sizes)
@@ -150,14 +150,14 @@ def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
     }
 
 
-def _as_dict(errors: PredictionErrors) -> dict[str, Any]:
+def _relative_errors(errors: PredictionErrors) -> dict[str, Any]:
     """Return ratios to persistence."""
     one_step = {
         actions: errors.of("teacher_forced", actions=actions).mean(axis=1).sum() for actions in get_args(ActionMode)
     }
-    rolled, nothing = (errors.of("rollout", actions=actions).sum(axis=0) for actions in ("true", "persistence"))
+    rollout, persistence = (errors.of("rollout", actions=actions).sum(axis=0) for actions in ("true", "persistence"))
     return {
-        "rollout_over_persistence": (rolled / nothing).tolist(),
+        "rollout_over_persistence": (rollout / persistence).tolist(),
         "one_step": float(one_step["true"] / one_step["persistence"]),
         "one_step_zero_actions": float(one_step["zero"] / one_step["persistence"]),
         "one_step_shuffled_actions": float(one_step["shuffled"] / one_step["persistence"]),

@@ -29,10 +29,10 @@ SHIFTS: dict[str, Domain | DomainRanges] = {
 degrees. randomized: in every episode another camera, light and textures, and three objects that circle on the table.
 Tasks of third-party environments (`environments.TASKS`) are changes, too."""
 
-SEEDS, MORE_SEEDS = 3, 5  # of the simulated arm, and where every episode differs
+SEEDS, MORE_SEEDS = 3, 5  # number of seeds: for domain shifts of the simulated arm, and for fully randomised scenes
 
 BASES: tuple[Base, ...] = ("one camera", "many cameras")
-"""one camera: trained on domain A alone. many cameras: on 800 worlds, each seen by another camera (the demo's base)."""
+"""one camera: trained on domain A only. many cameras: builtin:sim-tiny, trained on 800 scenes."""
 
 IN_OUT: Any = ("predictor_embed", "predictor_proj", "action_encoder", "state_encoder")
 AXES = "zero-shot, calibrated axes"
@@ -41,7 +41,7 @@ LONGER = f"{BEST}, 3x steps"
 BEFORE = "zero-shot, before the change"
 FROM_PRIOR = f"{BEST}, from a prior"
 PAST = (AXES, f"{BEST}, rollout of 1", f"{BEST}, rollout of 3", "in/out only", "DoRA r16")
-"""Methods whose measurements of commit 0d046757 stay in the tables, and which are not run again."""
+"""Methods whose measurements of commit 0d046757 remain in the tables, and which are not run again."""
 
 STEPS = 400
 TRAINING = TrainingConfig(
@@ -69,19 +69,19 @@ class Method:
     name: str
     kind: Literal["zero-shot", "LoRA", "full", "scratch", "cloned", "past"]  # past: of commit 0d046757, not run again
     rank: int = 0
-    in_out: bool = False  # whether the layers before and after the blocks are trained whole, beside the adapter
-    times: int = 1  # so many times the steps
-    prior: bool = False  # whether its search starts from an action prior of the same demonstrations
+    in_out: bool = False  # whether the input and output projections are trained in addition to the adapter
+    times: int = 1  # factor of the number of steps
+    prior: bool = False  # whether the search starts from an action prior, trained on the same demonstrations
     learning_rate: float = 1e-3
 
     @property
     def has_base(self) -> bool:
-        """Whether it begins with the weights of a base."""
+        """Whether training starts from a base model."""
         return not self.name.startswith("scratch") and self.kind != "cloned"
 
     @property
     def adapter(self) -> AdapterConfig:
-        """The adapter section of its config."""
+        """The config section `adapter`."""
         if self.kind != "LoRA":
             return AdapterConfig(kind="none")
         whole = IN_OUT if self.in_out else ()
@@ -89,7 +89,7 @@ class Method:
 
     @property
     def training(self) -> TrainingConfig:
-        """The training section of its config."""
+        """The config section `training`."""
         changes = {"steps": STEPS * self.times, "learning_rate": self.learning_rate, "allow_weak_base": True}
         return TRAINING.model_copy(update=changes)
 
@@ -124,28 +124,28 @@ CHOSEN = {
     },
     "Lift": {"scratch": 3e-3, "scratch, 3x steps": 6e-3},
 }
-"""Learning rates of a change, where another one was the best on validation goals (commit 0d046757)."""
+"""Learning rates by domain shift and method, if another rate was the best on validation goals (commit 0d046757)."""
 
 
-def method_of(name: str, shift: str = "look") -> Method:
-    """Return a method by its name, with the learning rate that was chosen for a change."""
+def get_method(name: str, shift: str = "look") -> Method:
+    """Return a method by its name, with its learning rate for a domain shift."""
     chosen = CHOSEN.get(shift if shift in SHIFTS else "Lift", {})
     return replace(METHODS[name], learning_rate=chosen.get(name, METHODS[name].learning_rate))
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One run: trained once, measured once."""
+    """One training and its measurement."""
 
-    shift: str  # of SHIFTS, or a task of environments.TASKS
+    shift: str  # a key of SHIFTS or of environments.TASKS
     base: Base
     method: str
     episodes: int  # demonstrations of the shifted domain
-    seed: int  # decides which demonstrations, fresh weights, order, and the goals
+    seed: int  # determines demonstrations, initial weights, order of clips, and goals
 
     @property
     def name(self) -> str:
-        """What its files are called."""
+        """Name of its files."""
         words = f"{self.shift}-{self.base}-{self.method}-k{self.episodes}-s{self.seed}"
         for long, short in ((" + in/out", "-io"), ("in/out", "io"), (", 3x steps", "-3x"), (",", ""), (" ", "-")):
             words = words.replace(long, short)
@@ -153,47 +153,47 @@ class Cell:
 
 
 def all_cells(at_most: int) -> Iterator[Cell]:
-    """Yield every cell, those that matter most first; of each change so many seeds, and no more than `at_most`."""
+    """Yield every cell, the most important first, with at most `at_most` seeds."""
     seeds = min(at_most, SEEDS)
     main = ("zero-shot", BEST, "full", "scratch")
     elsewhere = {BEFORE, LONGER, FROM_PRIOR, *main}
     others = tuple(
-        name for name, one in METHODS.items() if one.kind not in {"cloned", "past"} and name not in elsewhere
+        name for name, method in METHODS.items() if method.kind not in {"cloned", "past"} and name not in elsewhere
     )
     for seed in range(seeds):
-        yield from _of("look", main, 20, seed)
+        yield from _list_cells("look", main, 20, seed)
     for seed in range(seeds):
-        yield from _of("look", others, 20, seed)
+        yield from _list_cells("look", others, 20, seed)
     for seed in range(seeds):
-        yield from _of("motion", (*main, LONGER, "scratch, 3x steps"), 20, seed)
+        yield from _list_cells("motion", (*main, LONGER, "scratch, 3x steps"), 20, seed)
     for seed in range(min(at_most, MORE_SEEDS)):
-        yield from _of("randomized", ("zero-shot", BEST, "full", "scratch", "scratch, 3x steps"), 20, seed)
+        yield from _list_cells("randomized", ("zero-shot", BEST, "full", "scratch", "scratch, 3x steps"), 20, seed)
         yield Cell("randomized", "many cameras", LONGER, 20, seed)
     for seed in range(seeds):
         for episodes in (10, 40):
-            yield from _of("look", (BEST, "full", "scratch"), episodes, seed)
-        yield Cell("look", "none", "scratch, 3x steps", 10, seed)  # steps or demonstrations: which does a base save?
-    yield from world_cells(at_most)
+            yield from _list_cells("look", (BEST, "full", "scratch"), episodes, seed)
+        yield Cell("look", "none", "scratch, 3x steps", 10, seed)  # does a base model save steps or demonstrations?
+    yield from environment_cells(at_most)
 
 
-def world_cells(at_most: int) -> Iterator[Cell]:
-    """Yield the cells of worlds that others made."""
+def environment_cells(at_most: int) -> Iterator[Cell]:
+    """Yield the cells of third-party environments."""
     for seed in range(at_most):
-        for task, about in TASKS.items():
-            if seed == 0 and about.origin is None:
-                yield Cell(task, "one camera", BEFORE, 0, seed)
-            if seed < about.seeds:
-                yield from _of(task, IN_EVERY_WORLD, 20, seed)
-            if seed < about.seeds > 1:
-                yield Cell(task, "one camera", FROM_PRIOR, 20, seed)
+        for name, task in TASKS.items():
+            if seed == 0 and task.origin is None:
+                yield Cell(name, "one camera", BEFORE, 0, seed)
+            if seed < task.seeds:
+                yield from _list_cells(name, IN_EVERY_ENVIRONMENT, 20, seed)
+            if seed < task.seeds > 1:
+                yield Cell(name, "one camera", FROM_PRIOR, 20, seed)
     for episodes in (5, 80):
-        yield from _of("Lift", IN_EVERY_WORLD[1:], episodes, 0)
+        yield from _list_cells("Lift", IN_EVERY_ENVIRONMENT[1:], episodes, 0)
 
 
-IN_EVERY_WORLD = ("zero-shot", BEST, "full", "scratch, 3x steps", "behaviour cloning")
+IN_EVERY_ENVIRONMENT = ("zero-shot", BEST, "full", "scratch, 3x steps", "behaviour cloning")
 
 
-def _of(shift: str, methods: tuple[str, ...], episodes: int, seed: int) -> Iterator[Cell]:
+def _list_cells(shift: str, methods: tuple[str, ...], episodes: int, seed: int) -> Iterator[Cell]:
     for name in methods:
         bases: tuple[Base, ...] = BASES if shift in SHIFTS else BASES[:1]
         if not METHODS[name].has_base:

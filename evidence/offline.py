@@ -20,7 +20,7 @@ MOVES = 32  # clips whose moves are ranked
 
 
 @torch.no_grad()
-def offline_figures(model: WorldModel, space: ActionSpace, held_out: Sequence[LatentBatch]) -> dict[str, float]:
+def measure_offline(model: WorldModel, space: ActionSpace, held_out: Sequence[LatentBatch]) -> dict[str, float]:
     """Return the offline metrics on clips of held-out episodes."""
     true, predicted = LatentSums(), LatentSums()
     for batch in held_out:
@@ -28,9 +28,9 @@ def offline_figures(model: WorldModel, space: ActionSpace, held_out: Sequence[La
         rolled = model.rollout(batch.latents[:, :1], batch.actions, batch.states[:, :-1])
         predicted.add(rolled, batch.episode_ids)
     distribution = compare_distributions(predicted, true)
-    rows = [(batch, row) for batch in held_out for row in range(len(batch.starts))]
-    chosen = [rows[index] for index in np.linspace(0, len(rows) - 1, MOVES).astype(int)]
-    moves = [move for batch, row in chosen for move in select_moves(batch, row, space, 0.075)]
+    clips = [(batch, row) for batch in held_out for row in range(len(batch.starts))]
+    ranked = [clips[index] for index in np.linspace(0, len(clips) - 1, MOVES).astype(int)]
+    moves = [move for batch, row in ranked for move in select_moves(batch, row, space, 0.075)]
     ranking = rank_actions(model, moves, space, ProbeOptions(samples=32), seed=0)
     return {
         "action-ranking error": ranking.rank.value,
@@ -41,20 +41,20 @@ def offline_figures(model: WorldModel, space: ActionSpace, held_out: Sequence[La
 
 
 def correlations(
-    rows: Sequence[dict[str, Any]], outcomes: Sequence[float], of: Sequence[Hashable], draws: int = 2000
+    rows: Sequence[dict[str, Any]], outcomes: Sequence[float], groups: Sequence[Hashable], draws: int = 2000
 ) -> dict[str, Any]:
-    """Return Spearman's correlation of each number with an outcome, with a bootstrap interval.
+    """Return Spearman's correlation of each metric with an outcome, with a bootstrap interval.
 
-    Rows of one kind, such as the checkpoints of a run, are drawn together, because they are not independent.
+    Rows of the same group, such as the checkpoints of a run, are drawn together, because they are not independent.
     """
-    outcome, kinds = np.array(outcomes), list(dict.fromkeys(of))
-    places = [np.flatnonzero([one == kind for one in of]) for kind in kinds]
-    drawn = np.random.default_rng(0).integers(len(kinds), size=(draws, len(kinds)))
-    picks = [np.concatenate([places[kind] for kind in one]) for one in drawn]
+    outcome, distinct = np.array(outcomes), list(dict.fromkeys(groups))
+    indices = [np.flatnonzero([group == each for group in groups]) for each in distinct]
+    drawn = np.random.default_rng(0).integers(len(distinct), size=(draws, len(distinct)))
+    samples = [np.concatenate([indices[number] for number in numbers]) for numbers in drawn]
     result = {}
     for name in sorted(set.intersection(*(set(row) for row in rows))):
         values = np.array([row[name] for row in rows])
-        resampled = [spearmanr(values[one], outcome[one]).statistic for one in picks]
+        resampled = [spearmanr(values[sample], outcome[sample]).statistic for sample in samples]
         low, high = np.nanpercentile(resampled, [2.5, 97.5])
         result[name] = {"value": float(spearmanr(values, outcome).statistic), "low": float(low), "high": float(high)}
     return result

@@ -27,15 +27,15 @@ from vjepa2_ac.training.loop import train
 BUILTIN = "builtin:sim-tiny"
 EPISODES_A, EPISODES_SHIFTED = 400, 100
 SEED_A, SEED_SHIFTED = 11, 21  # seeds of recordings, which differ from those of the demo and its base model
-OF_A_WORLD = (
+TRAINING_OPTIONS = (
     "training.steps=4000", "training.learning_rate=4e-3", "training.warmup_steps=50", "training.allow_weak_base=true",
 )  # fmt: skip
-"""Options of the training of a world's base model, as in `configs/pick.yaml`."""
+"""Training options of the base model of a third-party environment, as in `configs/pick.yaml`."""
 BASE_CONFIG = "builtin:demo_base"  # the sizes and settings of the demo's base model
 
 
 def data_a(folder: Path) -> DataConfig:
-    """Return the data of domain A, on which the base of one camera is trained."""
+    """Return the data of domain A, on which the one-camera base model is trained."""
     return RldsData(
         path=str(folder / "data-A"),
         frames=4,
@@ -49,7 +49,7 @@ def data_a(folder: Path) -> DataConfig:
 
 
 def data_before(folder: Path, shift: str) -> DataConfig:
-    """Return the data that a base of one camera was trained on, before a shift."""
+    """Return the data on which the one-camera base model was trained, before a domain shift."""
     return data_a(folder) if shift in SHIFTS else data_of(folder, shift, "before")
 
 
@@ -62,23 +62,23 @@ def data_shifted(folder: Path, shift: str) -> DataConfig:
 
 
 def base_model(folder: Path, base: Base, seed: int, shift: str = "look") -> str:
-    """Return the value of `model.base` for a base, or for a predictor with fresh weights."""
+    """Return the value of `model.base` for a base model, or for a predictor with random weights."""
     if base == "many cameras":
         return BUILTIN
-    of_one = "base-one-camera" if shift in SHIFTS else f"base-{origin_of(shift)}"
-    return str(folder / (f"scratch-{seed}" if base == "none" else of_one))
+    one_camera = "base-one-camera" if shift in SHIFTS else f"base-{origin_of(shift)}"
+    return str(folder / (f"scratch-{seed}" if base == "none" else one_camera))
 
 
 def prepare_world(folder: Path, task: str, reporter: Reporter = SILENT) -> None:
-    """Make what the cells of a world need: demonstrations before and after its change, and a base of those before."""
+    """Make the inputs of a third-party task: demonstrations before and after the change, and a base model."""
     for when in ("before", "after"):
         record(folder, task, when)
-        keep_latents(data_of(folder, task, when), BUILTIN)  # all models share this encoder
+        cache_latents(data_of(folder, task, when), BUILTIN)  # all models have this encoder
     base = Path(base_model(folder, "one camera", 0, task))
     if not base.exists():
-        config = load_config(BASE_CONFIG, [f"run_dir={folder / f'run-{base.name}'}", *OF_A_WORLD])
-        start = config.model.with_base(BUILTIN)  # pre-trained on the simulated arm, not on this world
-        config = config.model_copy(update={"data": data_of(folder, task, "before"), "model": start})
+        config = load_config(BASE_CONFIG, [f"run_dir={folder / f'run-{base.name}'}", *TRAINING_OPTIONS])
+        model = config.model.with_base(BUILTIN)  # pre-trained on the simulated arm
+        config = config.model_copy(update={"data": data_of(folder, task, "before"), "model": model})
         export_run(train(config, reporter), base)
 
 
@@ -100,22 +100,22 @@ def prepare(folder: Path, shifts: Collection[str], seeds: int, reporter: Reporte
         export_run(run, Path(base_model(folder, "one camera", 0)))
     for data in (data_a(folder), *(data_shifted(folder, shift) for shift in SHIFTS)):
         for base in ("one camera", "many cameras"):
-            keep_latents(data, base_model(folder, base, 0))
+            cache_latents(data, base_model(folder, base, 0))
 
 
-def keep_latents(data: DataConfig, base: str) -> None:
-    """Encode the latents of all missing episodes; each cell uses a different subset."""
+def cache_latents(data: DataConfig, base: str) -> None:
+    """Encode all episodes that are not cached; each cell uses a different subset of them."""
     model = ModelConfig(base=base, dtype="float32")
     encode_config(Config(run_dir="none", data=data, model=model, training=TRAINING))
 
 
-def encoded(config: Config, model: WorldModel, split: Split, clips: int) -> list[LatentBatch]:
+def encode_clips(config: Config, model: WorldModel, split: Split, clips: int) -> list[LatentBatch]:
     """Return clips of a split, from the latents that training used."""
     dataset = use_finished_cache(config, open_dataset(config.data), model)
     return [encode(model, batch, chunk=64) for batch in read_clips(dataset, split, clips=clips, batch_size=32)]
 
 
-def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...]:
+def exclude_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...]:
     """Return the training episodes to *exclude* so that `count` remain, drawn by the seed.
 
     Raises:

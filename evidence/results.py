@@ -1,7 +1,7 @@
 """Read and write the results of both studies, and select and reduce them for the tables.
 
 While a study runs, every measurement is a JSON file with all numbers in the work folder. What the page needs of them is
-kept in the repository: `results/methods.json` and `results/selection.json`.
+stored in the repository: `results/methods.json` and `results/selection.json`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from methods import METHODS, Cell
 from vjepa2_ac.intervals import Estimate, estimate_share
 from vjepa2_ac.storage import write_atomically
 
-KEPT = Path(__file__).with_name("results")
+RESULTS = Path(__file__).with_name("results")
 REACHED_CM = 5.0
 CHANGES = {
     "look": "camera and appearance changed",
@@ -33,72 +33,72 @@ Figures = dict[str, Any]
 
 
 def read_all(
-    folder: Path, kept: Path, compact: Callable[[Figures], Figures], name_of: Callable[[Figures], str]
+    folder: Path, stored: Path, compact: Callable[[Figures], Figures], name_of: Callable[[Figures], str]
 ) -> list[Figures]:
     """Return the results of a work folder, and the stored results that it lacks, ordered by name."""
-    known = json.loads(kept.read_text()) if kept.exists() else []
+    previous = json.loads(stored.read_text()) if stored.exists() else []
     measured = [compact(json.loads(path.read_text())) for path in folder.glob("*.json")]
-    by_name = {name_of(one): one for one in (*known, *measured)}
+    by_name = {name_of(result): result for result in (*previous, *measured)}
     return [by_name[name] for name in sorted(by_name)]
 
 
 def write_all(path: Path, results: Sequence[Figures]) -> None:
     """Write one result per line, so that a diff shows which results changed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    lines = ",\n".join(json.dumps(one, separators=(",", ":")) for one in results)
+    lines = ",\n".join(json.dumps(result, separators=(",", ":")) for result in results)
     write_atomically(path, f"[\n{lines}\n]\n".encode())
 
 
 def rounded(value: Any) -> Any:
-    """Return numbers with eight significant digits, within lists and mappings too."""
+    """Return numbers with eight significant digits, also within lists and mappings."""
     if isinstance(value, float):
         return float(f"{value:.8g}")
     if isinstance(value, dict):
-        return {key: rounded(one) for key, one in value.items()}
-    return [rounded(one) for one in value] if isinstance(value, list) else value
+        return {key: rounded(item) for key, item in value.items()}
+    return [rounded(item) for item in value] if isinstance(value, list) else value
 
 
-def name_of(one: Figures) -> str:
+def name_of(result: Figures) -> str:
     """Return the name of the cell that a result of the methods study belongs to."""
-    return Cell(**one["cell"]).name
+    return Cell(**result["cell"]).name
 
 
 def compact(measured: Figures) -> Figures:
     """Return the values of a measurement that the tables and plots of the methods study need."""
-    kept: Figures = {"cell": {key: value for key, value in measured["cell"].items() if key != "name"}}
-    kept |= {
+    stored: Figures = {"cell": {key: value for key, value in measured["cell"].items() if key != "name"}}
+    stored |= {
         key: measured[key] for key in ("trained_share", "adapter_mb", "cpu_minutes", "made_with") if key in measured
     }
     if "shifted" in measured:
         errors = measured["shifted"]
-        kept["shifted"] = {key: errors[key] for key in ("rollout_over_persistence", *SHIFTED)}
+        stored["shifted"] = {key: errors[key] for key in ("rollout_over_persistence", *SHIFTED)}
     if "offline" in measured:
-        kept["offline"] = {name: value for name, value in measured["offline"].items() if "inverse" not in name}
-    kept["reach"] = {distance: _episodes(one) for distance, one in measured["reach"].items()}
+        stored["offline"] = {name: value for name, value in measured["offline"].items() if "inverse" not in name}
+    stored["reach"] = {distance: _episodes(result) for distance, result in measured["reach"].items()}
     if "baselines" in measured:
-        kept["baselines"] = {name: _episodes(one) for name, one in measured["baselines"].items()}
-    return rounded(kept)  # type: ignore[no-any-return]  # a mapping stays one
+        stored["baselines"] = {name: _episodes(result) for name, result in measured["baselines"].items()}
+    return rounded(stored)  # type: ignore[no-any-return]  # a mapping stays a mapping
 
 
 def _episodes(measured: Figures) -> Figures:
     """Return the final distances of closed-loop episodes, and which of them were solved."""
-    kept: Figures = {"ends_cm": [way[-1] for way in measured["distance_cm"]]}
+    stored: Figures = {"ends_cm": [distances[-1] for distances in measured["distance_cm"]]}
     if "visited" in measured:
-        kept["visited"] = measured["visited"]
+        stored["visited"] = measured["visited"]
     if "solved" in measured:
-        kept["solved"] = [int(flag) for flag in measured["solved"]]
+        stored["solved"] = [int(flag) for flag in measured["solved"]]
     if "hand_cm" in measured:
-        kept["arrived"] = [int(distance < REACHED_CM) for distance in measured["hand_cm"]]
-    return kept
+        stored["arrived"] = [int(distance < REACHED_CM) for distance in measured["hand_cm"]]
+    return stored
 
 
-def pick(results: Sequence[Figures], **wanted: Any) -> list[Figures]:
+def select_results(results: Sequence[Figures], **values: Any) -> list[Figures]:
     """Return the results whose cells have these values, by seed."""
-    chosen = [one for one in results if all(one["cell"][key] == value for key, value in wanted.items())]
-    return sorted(chosen, key=lambda one: one["cell"]["seed"])
+    selected = [result for result in results if all(result["cell"][key] == value for key, value in values.items())]
+    return sorted(selected, key=lambda result: result["cell"]["seed"])
 
 
-def label(method: str) -> str:
+def describe_method(method: str) -> str:
     """Return the name of a method in tables and plots."""
     for stored, shown in (
         ("zero-shot", "base model"),
@@ -114,28 +114,28 @@ def label(method: str) -> str:
     return "full fine-tuning" if method == "full" else method
 
 
-def main_cells(results: Sequence[Figures], base: str, method: str, shift: str = "look") -> list[Figures]:
+def select_main_cells(results: Sequence[Figures], base: str, method: str, shift: str = "look") -> list[Figures]:
     """Return a row of a main table: zero-shot needs no demonstrations, other methods have 20; some have no base."""
     episodes = 0 if METHODS[method].kind == "zero-shot" else 20
     base = base if METHODS[method].has_base else "none"
-    return pick(results, shift=shift, base=base, method=method, episodes=episodes)
+    return select_results(results, shift=shift, base=base, method=method, episodes=episodes)
 
 
-def of_policy(results: Sequence[Figures], base: str, name: str, shift: str = "look") -> list[Figures]:
+def select_policy(results: Sequence[Figures], base: str, name: str, shift: str = "look") -> list[Figures]:
     """Return the results of a policy without a model on the goals of a base model's cells."""
-    chosen = pick(results, shift=shift, base=base, method="zero-shot")
-    return [{"reach": {"l1": one["baselines"][name]}} for one in chosen if "baselines" in one]
+    zero_shot = select_results(results, shift=shift, base=base, method="zero-shot")
+    return [{"reach": {"l1": result["baselines"][name]}} for result in zero_shot if "baselines" in result]
 
 
-def reached(one: Figures) -> list[bool]:
+def list_reached(result: Figures) -> list[bool]:
     """Return which goals were reached; in third-party environments, which problems were solved."""
-    episodes = one["reach"]["l1"]
+    episodes = result["reach"]["l1"]
     if "solved" in episodes:
         return [bool(flag) for flag in episodes["solved"]]
     return [end < REACHED_CM for end in episodes["ends_cm"]]
 
 
-def share_reached(results: Sequence[Figures]) -> Estimate:
+def estimate_success(results: Sequence[Figures]) -> Estimate:
     """Return the share of all goals that were reached, with Wilson's interval."""
-    flags = [flag for one in results for flag in reached(one)]
+    flags = [flag for result in results for flag in list_reached(result)]
     return estimate_share(sum(flags), len(flags))

@@ -109,7 +109,7 @@ def prepare(folder: Path) -> None:
             record_dataset(folder / f"data-{name}", spec, episodes=EPISODES)
 
 
-def config_of(run: Run, folder: Path) -> Config:
+def make_config(run: Run, folder: Path) -> Config:
     """Return the config of a run; every checkpoint is kept."""
     shares = {"frames": 8, "validation_share": 0.2, "test_share": 0.2}
     data = data_a(folder).model_copy(update={"path": str(folder / f"data-{run.motions}"), **shares})
@@ -132,13 +132,13 @@ def config_of(run: Run, folder: Path) -> Config:
 def train_alone(run: Run, folder: Path) -> None:
     """Train a run on one thread, from its newest checkpoint; a finished run returns at once."""
     torch.set_num_threads(1)
-    train(config_of(run, folder), SILENT)
+    train(make_config(run, folder), SILENT)
 
 
 def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Measure a checkpoint of a trained run on one thread."""
     torch.set_num_threads(1)
-    config = config_of(cell.run, folder)
+    config = make_config(cell.run, folder)
     home, step = Path(config.run_dir), str(cell.step)
     rows = [row for row in read_metrics_log(home / "metrics.jsonl") if row["kind"] == "validation"]
     (validated,) = (row for row in rows if row["step"] == cell.step)
@@ -159,14 +159,14 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     }
 
 
-def name_of(one: dict[str, Any]) -> str:
+def name_of(result: dict[str, Any]) -> str:
     """Return the name of the checkpoint that a result belongs to."""
-    return Cell(run_of(one), one["cell"]["step"]).name
+    return Cell(run_of(result), result["cell"]["step"]).name
 
 
-def run_of(one: dict[str, Any]) -> Run:
+def run_of(result: dict[str, Any]) -> Run:
     """Return the run that a result belongs to."""
-    return Run(**{key: value for key, value in one["cell"].items() if key != "step"})
+    return Run(**{key: value for key, value in result["cell"].items() if key != "step"})
 
 
 def compact(measured: dict[str, Any]) -> dict[str, Any]:

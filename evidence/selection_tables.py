@@ -1,4 +1,4 @@
-"""Write the tables of the selection study: which checkpoint each rule selects, and which number predicts success."""
+"""Write the tables of the selection study: which checkpoint each rule selects, and which metric predicts success."""
 
 from __future__ import annotations
 
@@ -27,34 +27,36 @@ TITLES = {
 def _selected(run: list[Figures]) -> Figures:
     """Return the checkpoint that a run with these validations selects."""
     state = RunState(0)
-    for one in run:
-        state = replace(state, step=one["cell"]["step"]).with_validation(one["error"], one["action_ranking_error"])
-    return next(one for one in run if one["cell"]["step"] == state.best_step)
+    for checkpoint in run:
+        state = replace(state, step=checkpoint["cell"]["step"]).with_validation(
+            checkpoint["error"], checkpoint["action_ranking_error"]
+        )
+    return next(checkpoint for checkpoint in run if checkpoint["cell"]["step"] == state.best_step)
 
 
 RULES: dict[str, Callable[[list[Figures]], Figures]] = {
     "base": lambda run: run[0],
     "last": lambda run: run[-1],
-    "best by error": lambda run: min(run, key=lambda one: float(one["error"])),
+    "best by error": lambda run: min(run, key=lambda checkpoint: float(checkpoint["error"])),
     "best by ranking": _selected,
 }
 
 
-def write_tables(results: Sequence[Figures], path: Path, plot: Path) -> None:
+def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:
     """Write the table and the plot, of runs of which every checkpoint is measured."""
     runs = [run for run in by_run(results) if len(run) == len(cells_of(run_of(run[0])))]
     path.write_text("\n".join([*_rules(runs), "", *_correlations(runs)]) + "\n")
-    draw(runs, plot)
+    draw(runs, docs / "ranking.png")
 
 
 def by_run(results: Sequence[Figures]) -> list[list[Figures]]:
     """Return the checkpoints of each run, by step."""
 
-    def key(one: Figures) -> tuple[str, str, str, int]:
-        cell = one["cell"]
+    def key(checkpoint: Figures) -> tuple[str, str, str, int]:
+        cell = checkpoint["cell"]
         return cell["motions"], cell["method"], cell["cure"], cell["seed"]
 
-    ordered = sorted(results, key=lambda one: (*key(one), one["cell"]["step"]))
+    ordered = sorted(results, key=lambda checkpoint: (*key(checkpoint), checkpoint["cell"]["step"]))
     return [list(group) for _, group in groupby(ordered, key)]
 
 
@@ -65,16 +67,19 @@ def _rules(runs: Sequence[list[Figures]]) -> Iterator[str]:
     )
     yield "|---" * 9 + "|"
     for kind, group in groupby(runs, lambda run: [run[0]["cell"][name] for name in ("motions", "method", "cure")]):
-        of_kind = list(group)
-        for rule, choose in RULES.items():
-            chosen = [choose(run) for run in of_kind]
-            goals, left = sum(one["goals"] for one in chosen), [one["left_cm"] for one in chosen]
-            share = estimate_share(sum(one["reached"] for one in chosen), goals)
+        runs_of_kind = list(group)
+        for rule, select in RULES.items():
+            selected = [select(run) for run in runs_of_kind]
+            goals, distances = (
+                sum(checkpoint["goals"] for checkpoint in selected),
+                [checkpoint["left_cm"] for checkpoint in selected],
+            )
+            share = estimate_share(sum(checkpoint["reached"] for checkpoint in selected), goals)
             row = [
-                *(*kind, rule, ", ".join(str(one["cell"]["step"]) for one in chosen)),
-                *(_list([one[key] for one in chosen], 3) for key in ("error", "action_ranking_error")),
+                *(*kind, rule, ", ".join(str(checkpoint["cell"]["step"]) for checkpoint in selected)),
+                *(_list([checkpoint[key] for checkpoint in selected], 3) for key in ("error", "action_ranking_error")),
                 f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}] of {goals}",
-                f"{np.mean(left):.1f} ({_list(left, 1)})",
+                f"{np.mean(distances):.1f} ({_list(distances, 1)})",
             ]
             yield f"| {' | '.join(row)} |"
 
@@ -85,17 +90,27 @@ def _list(values: Sequence[float], digits: int) -> str:
 
 def _correlations(runs: Sequence[list[Figures]]) -> Iterator[str]:
     """Yield a table of rank correlations with the distance left to the goal; runs are drawn as a whole."""
-    results = [one for run in runs for one in run if not one["cell"]["cure"]]
-    parts = {name: [one for one in results if one["cell"]["motions"] == name] for name in ("narrow", "varied")}
-    parts = {"all": results, **parts}
+    results = [checkpoint for run in runs for checkpoint in run if not checkpoint["cell"]["cure"]]
+    subsets = {
+        name: [checkpoint for checkpoint in results if checkpoint["cell"]["motions"] == name]
+        for name in ("narrow", "varied")
+    }
+    subsets = {"all": results, **subsets}
     columns = [
-        correlations([one["offline"] for one in part], [one["left_cm"] for one in part], list(map(run_of, part)))
-        for part in parts.values()
+        correlations(
+            [checkpoint["offline"] for checkpoint in subset],
+            [checkpoint["left_cm"] for checkpoint in subset],
+            list(map(run_of, subset)),
+        )
+        for subset in subsets.values()
     ]
-    yield f"| metric, over {len(results)} checkpoints | {' | '.join(parts)} |"
-    yield "|---" * (len(parts) + 1) + "|"
+    yield f"| metric, over {len(results)} checkpoints | {' | '.join(subsets)} |"
+    yield "|---" * (len(subsets) + 1) + "|"
     for name, title in TITLES.items():
-        cells = [f"{one[name]['value']:+.2f} [{one[name]['low']:+.2f}, {one[name]['high']:+.2f}]" for one in columns]
+        cells = [
+            f"{estimates[name]['value']:+.2f} [{estimates[name]['low']:+.2f}, {estimates[name]['high']:+.2f}]"
+            for estimates in columns
+        ]
         yield f"| {title} | {' | '.join(cells)} |"
 
 
@@ -105,22 +120,24 @@ def draw(runs: Sequence[list[Figures]], path: Path) -> None:
 
     figure = new_figure(9.2, 5.4, layout="constrained")
     panels = figure.subplots(2, 3, sharex=True)
-    shown = {
+    plotted = {
         "error": "rollout error / persistence",
         "action_ranking_error": "action-ranking error",
         "left_cm": "final distance in closed loop, cm",
     }
     names = {"narrow": "Low-diversity data", "varied": "Diverse data", "LoRA": "LoRA", "full": "full fine-tuning"}
     for row, motions in zip(panels, ("narrow", "varied"), strict=True):
-        for axes, (key, title) in zip(row, shown.items(), strict=True):
+        for axes, (key, title) in zip(row, plotted.items(), strict=True):
             for run in runs:
-                about = run[0]["cell"]
-                if about["motions"] != motions or about["cure"]:
+                condition = run[0]["cell"]
+                if condition["motions"] != motions or condition["cure"]:
                     continue
-                colour = "#1f77b4" if about["method"] == "LoRA" else "#d62728"
-                label = names[about["method"]] if about["seed"] == 0 else None
-                steps = [one["cell"]["step"] for one in run]
-                axes.plot(steps, [one[key] for one in run], color=colour, marker=".", alpha=0.8, label=label)
+                colour = "#1f77b4" if condition["method"] == "LoRA" else "#d62728"
+                label = names[condition["method"]] if condition["seed"] == 0 else None
+                steps = [checkpoint["cell"]["step"] for checkpoint in run]
+                axes.plot(
+                    steps, [checkpoint[key] for checkpoint in run], color=colour, marker=".", alpha=0.8, label=label
+                )
             axes.set_ylim(bottom=0)
             axes.set_title(f"{names[motions]}\n{title}", fontsize=11)
     for axes in panels[1]:

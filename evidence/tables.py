@@ -9,9 +9,19 @@ from textwrap import fill
 
 import numpy as np
 from environments import TASKS
-from methods import AXES, BASES, BEFORE, BEST, FROM_PRIOR, IN_EVERY_WORLD, LONGER, METHODS, SHIFTS
+from methods import AXES, BASES, BEFORE, BEST, FROM_PRIOR, IN_EVERY_ENVIRONMENT, LONGER, METHODS, SHIFTS
 from offline import correlations
-from results import BASE_MODELS, CHANGES, Figures, label, main_cells, of_policy, pick, reached, share_reached
+from results import (
+    BASE_MODELS,
+    CHANGES,
+    Figures,
+    describe_method,
+    estimate_success,
+    list_reached,
+    select_main_cells,
+    select_policy,
+    select_results,
+)
 from scipy.stats import binomtest
 
 from vjepa2_ac.intervals import estimate_mean, estimate_share
@@ -49,8 +59,8 @@ NOTES = """- *rollout error*: L1 error relative to persistence, on held-out epis
   of*, *projections only*, *DoRA*, *Action Score*."""
 
 
-def write_tables(results: Sequence[Figures], path: Path, page: Path) -> None:
-    """Write all rows to a file, and the short tables between their marks in a page."""
+def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:
+    """Write all rows to a file, the short tables between their marks in docs/evidence.md, and the plot."""
     correlated = correlated_numbers(results)
     parts = (*_rows(results), goal_by_goal(results), f"{NOTES}\n{_made_with(results)}")
     path.write_text("\n\n".join(part for part in parts if part) + "\n")
@@ -61,10 +71,16 @@ def write_tables(results: Sequence[Figures], path: Path, page: Path) -> None:
     }
     for part, table in texts.items():
         if table:
-            begin, end = (f"<!-- {MARKS[part]}: {word} -->" for word in ("begin", "end"))
-            before, rest = page.read_text().split(begin)
-            _, after = rest.split(end)
-            page.write_text(f"{before}{begin}\n{table}\n{end}{after}")
+            insert_table(docs / "evidence.md", MARKS[part], table)
+    draw(results, docs / "evidence.png")
+
+
+def insert_table(page: Path, mark: str, table: str) -> None:
+    """Replace the text between the marks of a table in a page."""
+    begin, end = (f"<!-- {mark}: {word} -->" for word in ("begin", "end"))
+    before, rest = page.read_text().split(begin)
+    _, after = rest.split(end)
+    page.write_text(f"{before}{begin}\n{table}\n{end}{after}")
 
 
 def summary(results: Sequence[Figures]) -> str:
@@ -73,18 +89,20 @@ def summary(results: Sequence[Figures]) -> str:
     for shift in SHIFTS:
         columns = [(base, shift) for base in BASES]
         heads = [BASE_MODELS[base] for base in BASES]
-        count = sum(len(reached(one)) for one in main_cells(results, BASES[0], BEST, shift))
+        count = sum(len(list_reached(result)) for result in select_main_cells(results, BASES[0], BEST, shift))
         parts.append(f"**{_titled(CHANGES[shift])}** ({count} goals)\n\n{_rates(results, SHORT, columns, heads)}")
     return "\n\n".join(parts)
 
 
 def summary_of_tasks(results: Sequence[Figures]) -> str:
     """Return the success rate of each method on tasks of third-party environments, with Wilson's interval."""
-    tasks = [task for task in SHOWN_TASKS if pick(results, shift=task, method=BEST)]
-    goals = [sum(len(reached(one)) for one in main_cells(results, BASES[0], BEST, task)) for task in tasks]
+    tasks = [task for task in SHOWN_TASKS if select_results(results, shift=task, method=BEST)]
+    goals = [
+        sum(len(list_reached(result)) for result in select_main_cells(results, BASES[0], BEST, task)) for task in tasks
+    ]
     heads = [f"{SHOWN_TASKS[task]}, {count} problems" for task, count in zip(tasks, goals, strict=True)]
     columns = [(BASES[0], task) for task in tasks]
-    return _rates(results, (BEFORE, *IN_EVERY_WORLD, FROM_PRIOR), columns, heads) if tasks else ""
+    return _rates(results, (BEFORE, *IN_EVERY_ENVIRONMENT, FROM_PRIOR), columns, heads) if tasks else ""
 
 
 def _rates(
@@ -94,9 +112,9 @@ def _rates(
     rows = ["| Method | " + " | ".join(f"{head} | 95 % interval" for head in heads) + " |"]
     rows.append("|---" * (2 * len(heads) + 1) + "|")
     for method in methods:
-        cells = [main_cells(results, base, method, shift) for base, shift in columns]
+        cells = [select_main_cells(results, base, method, shift) for base, shift in columns]
         if any(cells):
-            rows.append(f"| {label(method)} | {' | '.join(map(_share, cells))} |")
+            rows.append(f"| {describe_method(method)} | {' | '.join(map(_share, cells))} |")
     return "\n".join(rows)
 
 
@@ -104,7 +122,7 @@ def _share(cells: Sequence[Figures]) -> str:
     """Return a success rate and its interval, as two cells of a table."""
     if not cells:
         return "not measured | "
-    share = share_reached(cells)
+    share = estimate_success(cells)
     return f"{100 * share.value:.0f} % | {100 * share.low:.0f} to {100 * share.high:.0f} %"
 
 
@@ -113,13 +131,14 @@ def _rows(results: Sequence[Figures]) -> Iterator[str]:
     for shift in (*SHIFTS, *TASKS):
         for base in (*BASES, "none"):
             rows = [
-                _row(name, "", of_policy(results, base, name, shift)) for name in ("zero action", "random", "oracle")
+                _row(name, "", select_policy(results, base, name, shift))
+                for name in ("zero action", "random", "oracle")
             ]
-            counts = sorted({one["cell"]["episodes"] for one in pick(results, shift=shift, base=base)})
+            counts = sorted({result["cell"]["episodes"] for result in select_results(results, shift=shift, base=base)})
             for method in METHODS:
                 for count in counts:
-                    cells = pick(results, shift=shift, base=base, method=method, episodes=count)
-                    rows.append(_row(label(method), str(count or ""), cells))
+                    cells = select_results(results, shift=shift, base=base, method=method, episodes=count)
+                    rows.append(_row(describe_method(method), str(count or ""), cells))
             if any(rows):
                 title = f"### {_titled(CHANGES.get(shift, shift))}, {BASE_MODELS[base]}"
                 rule = "|" + "---|" * (HEAD.count("|") + 1)
@@ -135,16 +154,18 @@ def _row(name: str, demonstrations: str, cells: Sequence[Figures]) -> str:
     if not cells:
         return ""
     error = wrong = trained = size = minutes = ""
-    if shifted := [one["shifted"] for one in cells if "shifted" in one]:
-        errors = np.array([one["rollout_over_persistence"] for one in shifted])
+    if shifted := [result["shifted"] for result in cells if "shifted" in result]:
+        errors = np.array([result["rollout_over_persistence"] for result in shifted])
         means = " / ".join(f"{value:.3f}" for value in errors.mean(axis=0))
         error = f"{means} ({errors[:, -1].min():.3f} to {errors[:, -1].max():.3f})"
-        zero, shuffled = (np.mean([one[f"one_step_{way}_actions"] for one in shifted]) for way in ("zero", "shuffled"))
+        zero, shuffled = (
+            np.mean([result[f"one_step_{mode}_actions"] for result in shifted]) for mode in ("zero", "shuffled")
+        )
         wrong = f"{zero:.3f} / {shuffled:.3f}"
     if cells[0].get("trained_share"):
         trained, size = f"{cells[0]['trained_share']:.1%}", f"{cells[0]['adapter_mb']:.2f}"
-        minutes = f"{np.mean([one['cpu_minutes'] for one in cells]):.1f}"
-    arrived = [flag for one in cells for flag in one["reach"]["l1"].get("arrived", ())]
+        minutes = f"{np.mean([result['cpu_minutes'] for result in cells]):.1f}"
+    arrived = [flag for result in cells for flag in result["reach"]["l1"].get("arrived", ())]
     hand = f"{np.mean(arrived):.0%}" if arrived else ""
     row = [name, demonstrations, error, wrong, _reach(cells), _distance(cells), hand, trained, size, minutes]
     return f"| {' | '.join(row)} |"
@@ -152,15 +173,15 @@ def _row(name: str, demonstrations: str, cells: Sequence[Figures]) -> str:
 
 def _reach(cells: Sequence[Figures]) -> str:
     """Return the share of all goals with Wilson's interval, and how many each seed reached."""
-    by_seed = [reached(one) for one in cells]
+    by_seed = [list_reached(result) for result in cells]
     share = estimate_share(sum(map(sum, by_seed)), sum(map(len, by_seed)))
     seeds = ", ".join(str(sum(flags)) for flags in by_seed)
     return f"{share.value:.0%} ({share.low:.0%} to {share.high:.0%}) of {sum(map(len, by_seed))}: {seeds}"
 
 
 def _distance(cells: Sequence[Figures]) -> str:
-    ends = np.array([end for one in cells for end in one["reach"]["l1"]["ends_cm"]])
-    mean = estimate_mean(ends, [str(place) for place in range(len(ends))])
+    ends = np.array([end for result in cells for end in result["reach"]["l1"]["ends_cm"]])
+    mean = estimate_mean(ends, [str(index) for index in range(len(ends))])
     return f"{mean.value:.1f} ({mean.low:.1f} to {mean.high:.1f})" if mean.has_interval else f"{mean.value:.1f}"
 
 
@@ -180,8 +201,8 @@ def goal_by_goal(results: Sequence[Figures]) -> str:
                     chance = binomtest(won, won + lost).pvalue
                     where = f"{CHANGES.get(shift, shift)}{f', {BASE_MODELS[base]}' * (shift in SHIFTS)}"
                     p = f"{chance:.3f}" if chance >= 0.0005 else "< 0.001"
-                    rows.append(f"| {where} | {label(other)} | {len(pairs)} | {won} | {lost} | {p} |")
-    title = f"### {label(BEST)}, compared goal by goal"
+                    rows.append(f"| {where} | {describe_method(other)} | {len(pairs)} | {won} | {lost} | {p} |")
+    title = f"### {describe_method(BEST)}, compared goal by goal"
     heads = "domain shift | compared with | goals | reached by LoRA only | reached by the other only | p"
     head = f"{title}\n\n| {heads} |\n|" + "---|" * 6
     return "\n".join([head, *rows]) if rows else ""
@@ -189,32 +210,32 @@ def goal_by_goal(results: Sequence[Figures]) -> str:
 
 def _pairs(results: Sequence[Figures], shift: str, base: str, other: str) -> Iterator[tuple[bool, bool]]:
     """Yield which goals LoRA and another method reached, with the demonstrations of the main tables."""
-    ours = {one["cell"]["seed"]: one for one in main_cells(results, base, BEST, shift)}
-    for theirs in main_cells(results, base, other, shift):
-        if one := ours.get(theirs["cell"]["seed"]):
-            yield from zip(reached(one), reached(theirs), strict=True)
+    ours = {result["cell"]["seed"]: result for result in select_main_cells(results, base, BEST, shift)}
+    for theirs in select_main_cells(results, base, other, shift):
+        if result := ours.get(theirs["cell"]["seed"]):
+            yield from zip(list_reached(result), list_reached(theirs), strict=True)
 
 
 def correlated_numbers(results: Sequence[Figures]) -> Correlated:
-    """Return correlations of offline numbers with goals missed: over all changes of the simulated arm, and one."""
-    cells = [one for one in results if "offline" in one and "visited" in one["reach"]["l1"]]
-    groups = {"all": cells, "randomized": [one for one in cells if one["cell"]["shift"] == "randomized"]}
+    """Return correlations of offline metrics with missed goals: for all domain shifts, and for randomised scenes."""
+    cells = [result for result in results if "offline" in result and "visited" in result["reach"]["l1"]]
+    groups = {"all": cells, "randomized": [result for result in cells if result["cell"]["shift"] == "randomized"]}
     correlated = {}
-    for shift, some in groups.items():
-        if len(some) >= FEWEST:
-            missed = [-float(np.mean(reached(one))) for one in some]
-            kinds = [tuple(one["cell"][key] for key in ("shift", "base", "method", "episodes")) for one in some]
-            correlated[shift] = len(some), correlations([_offline_row(one) for one in some], missed, kinds)
+    for shift, group in groups.items():
+        if len(group) >= FEWEST:
+            missed = [-float(np.mean(list_reached(result))) for result in group]
+            kinds = [tuple(result["cell"][key] for key in ("shift", "base", "method", "episodes")) for result in group]
+            correlated[shift] = len(group), correlations([_offline_row(result) for result in group], missed, kinds)
     return correlated
 
 
-def _offline_row(one: Figures) -> dict[str, float]:
-    shifted = one["shifted"]
+def _offline_row(result: Figures) -> dict[str, float]:
+    shifted = result["shifted"]
     errors = enumerate(shifted["rollout_over_persistence"], start=1)
     return {
         **{f"error over persistence, {step} steps": value for step, value in errors},
         "cost of wrong actions, negative": 1 - shifted["one_step_shuffled_actions"] / shifted["one_step"],
-        **one["offline"],
+        **result["offline"],
     }
 
 
@@ -227,19 +248,19 @@ def summary_of_correlations(correlated: Correlated) -> str:
         f"| {words} | {' | '.join(_interval(numbers[name]) for _, numbers in correlated.values())} |"
         for name, words in OFFLINE.items()
     ]
-    head = " | ".join(f"{one} | 95 % interval" for one in heads)
+    head = " | ".join(f"{title} | 95 % interval" for title in heads)
     return "\n".join([f"| Metric | {head} |", "|---" * (2 * len(heads) + 1) + "|", *rows])
 
 
-def _interval(one: dict[str, float]) -> str:
-    return f"{one['value']:.2f} | {one['low']:.2f} to {one['high']:.2f}"
+def _interval(estimate: dict[str, float]) -> str:
+    return f"{estimate['value']:.2f} | {estimate['low']:.2f} to {estimate['high']:.2f}"
 
 
 def _made_with(results: Sequence[Figures]) -> str:
     """Return which commits and versions computed the cells, and how many each."""
     names = Counter(
-        "torch {torch}, commit {commit}".format(**one["made_with"]) if "made_with" in one else "not recorded"
-        for one in results
+        "torch {torch}, commit {commit}".format(**result["made_with"]) if "made_with" in result else "not recorded"
+        for result in results
     )
     return "- Made with " + "; ".join(f"{name} ({count} cells)" for name, count in names.most_common()) + "."
 
@@ -250,17 +271,17 @@ def draw(results: Sequence[Figures], path: Path) -> None:
 
     figure = new_figure(8.0, 5.0, layout="constrained")
     axes = figure.subplots()
-    groups, shown = [(shift, base) for shift in SHIFTS for base in BASES], {}
-    for place, (name, colour) in enumerate(COLOURS.items()):
+    groups, bars = [(shift, base) for shift in SHIFTS for base in BASES], {}
+    for position, (name, colour) in enumerate(COLOURS.items()):
         for group, (shift, base) in enumerate(groups):
-            if cells := main_cells(results, base, name, shift):
-                share, at = share_reached(cells), group + 0.16 * (place - 2)
+            if cells := select_main_cells(results, base, name, shift):
+                share, at = estimate_success(cells), group + 0.16 * (position - 2)
                 error = [[share.value - share.low], [share.high - share.value]]
-                shown[label(name)] = axes.bar(at, share.value, 0.15, yerr=error, capsize=2, color=colour)
+                bars[describe_method(name)] = axes.bar(at, share.value, 0.15, yerr=error, capsize=2, color=colour)
     names = [f"{fill(CHANGES[shift], 14)}\n({fill(base, 14)})" for shift, base in groups]
     axes.set_xticks(range(len(groups)), names)
     axes.set_ylim(0, 1.05)
     axes.set_ylabel("success rate (within 5 cm of the goal at the end)")
     axes.set_title("Reach after a domain shift, 20 demonstrations; error bars: 95 % intervals")
-    axes.legend(shown.values(), shown, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.23))
+    axes.legend(bars.values(), bars, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.23))
     figure.savefig(path, dpi=140)

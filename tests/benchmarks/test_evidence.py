@@ -18,7 +18,7 @@ from vjepa2_ac.simulation.record import RecordingSpec
 
 MODULES = (
     "environments", "methods", "prepare", "offline", "results", "measure", "tables", "selection",
-    "selection_tables",
+    "selection_tables", "labs", "labs_tables",
 )  # fmt: skip
 
 
@@ -35,19 +35,19 @@ def evidence() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def stored(evidence: Any) -> list[dict[str, Any]]:
     """The results of the methods study in the repository."""
-    return json.loads((evidence.results.KEPT / "methods.json").read_text())
+    return json.loads((evidence.results.RESULTS / "methods.json").read_text())
 
 
 def test_condition_names_are_unique_and_each_stored_result_has_a_condition(evidence: Any, stored: Any) -> None:
     cells = list(evidence.methods.all_cells(at_most=5))
     assert len({cell.name for cell in cells}) == len(set(cells)) == len(cells)
     assert not any("/" in cell.name for cell in cells), "names of files"
-    names = {evidence.results.name_of(one) for one in stored}
+    names = {evidence.results.name_of(result) for result in stored}
     assert len(names) == len(stored)
     assert {cell.name for cell in cells} <= names, "every cell is measured"
     checkpoints = list(evidence.selection.all_cells(seeds=3))
-    selection = json.loads((evidence.results.KEPT / "selection.json").read_text())
-    assert {cell.name for cell in checkpoints} <= {evidence.selection.name_of(one) for one in selection}
+    selection = json.loads((evidence.results.RESULTS / "selection.json").read_text())
+    assert {cell.name for cell in checkpoints} <= {evidence.selection.name_of(result) for result in selection}
 
 
 def test_tables_of_the_page_equal_the_stored_results(evidence: Any, stored: Any) -> None:
@@ -55,23 +55,23 @@ def test_tables_of_the_page_equal_the_stored_results(evidence: Any, stored: Any)
     assert evidence.tables.summary(stored) in page
     assert evidence.tables.summary_of_tasks(stored) in page
     assert evidence.tables.summary_of_correlations(evidence.tables.correlated_numbers(stored)) in page
-    text = (evidence.results.KEPT / "methods.md").read_text()
+    text = (evidence.results.RESULTS / "methods.md").read_text()
     assert "\n\n".join(evidence.tables._rows(stored)) in text
     assert evidence.tables.goal_by_goal(stored) in text
-    selection = json.loads((evidence.results.KEPT / "selection.json").read_text())
+    selection = json.loads((evidence.results.RESULTS / "selection.json").read_text())
     rules = "\n".join(evidence.selection_tables._rules(evidence.selection_tables.by_run(selection)))
-    assert rules in (evidence.results.KEPT / "selection.md").read_text()
-    assert sum(path.stat().st_size for path in evidence.results.KEPT.glob("*.json")) < 300_000
+    assert rules in (evidence.results.RESULTS / "selection.md").read_text()
+    assert sum(path.stat().st_size for path in evidence.results.RESULTS.glob("*.json")) < 300_000
 
 
 @pytest.fixture(scope="module")
 def small(evidence: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """Everything at its smallest: two steps, one goal; the numbers mean nothing."""
+    """Return the modules with the smallest settings: two steps, one goal."""
     methods, prepare, measure = evidence.methods, evidence.prepare, evidence.measure
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(methods, "STEPS", 2)
         patch.setattr(methods, "TRAINING", methods.TRAINING.model_copy(update={"warmup_steps": 1, "batch_size": 2}))
-        patch.setattr(measure, "ValidationConfig", lambda clips, **given: ValidationConfig(clips=clips // 10, **given))
+        patch.setattr(measure, "ValidationConfig", lambda clips, **keys: ValidationConfig(clips=clips // 10, **keys))
         few = methods.PLANNING.model_copy(update={"samples": 12, "iterations": 1})
         patch.setattr(measure, "PLANNING", few)
         patch.setattr(measure, "CLIPS", 6)
@@ -83,10 +83,10 @@ def small(evidence: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[A
         make = prepare.data_shifted
         held_out = {"validation_share": 0.2, "test_share": 0.3}
         for module in (prepare, measure):
-            patch.setattr(module, "data_shifted", lambda *given: make(*given).model_copy(update=held_out))
+            patch.setattr(module, "data_shifted", lambda *arguments: make(*arguments).model_copy(update=held_out))
         data = prepare.data_shifted(evidence.folder, "look")
         prepare._record(data, "look", 11, 3)
-        prepare.keep_latents(data, prepare.BUILTIN)
+        prepare.cache_latents(data, prepare.BUILTIN)
         yield evidence
 
 
@@ -94,16 +94,16 @@ def small(evidence: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[A
 def test_experimental_condition_is_trained_and_measured(small: Any, method: str) -> None:
     base = "none" if method == "behaviour cloning" else "many cameras"
     cell = small.methods.Cell("look", base, method, 0 if method == "zero-shot" else 4, 0)
-    figures = json.loads(json.dumps(small.measure.measure(cell, small.folder, 1)))
-    assert len(figures["reach"]["l1"]["distance_cm"][0]) == 9
-    assert ("offline" in figures) == ("shifted" in figures) == (method != "behaviour cloning")
-    assert set(figures["made_with"]) == {"torch", "commit"}
-    assert (figures["trained_share"] == 0) == (method == "zero-shot")
-    compact = small.results.compact(figures)
+    result = json.loads(json.dumps(small.measure.measure(cell, small.folder, 1)))
+    assert len(result["reach"]["l1"]["distance_cm"][0]) == 9
+    assert ("offline" in result) == ("shifted" in result) == (method != "behaviour cloning")
+    assert set(result["made_with"]) == {"torch", "commit"}
+    assert (result["trained_share"] == 0) == (method == "zero-shot")
+    compact = small.results.compact(result)
     row = small.tables._row(method, "20", [compact])
     assert row.count("|") == small.tables.HEAD.count("|") + 2
     if method == "zero-shot":
-        ends = {name: one["ends_cm"][0] for name, one in compact["baselines"].items()}
+        ends = {name: policy["ends_cm"][0] for name, policy in compact["baselines"].items()}
         assert ends["oracle"] < 1 < ends["zero action"]
 
 
@@ -111,6 +111,52 @@ def test_runs_of_the_selection_study_differ_and_the_plots_are_drawn(evidence: An
     runs = {cell.run for cell in evidence.selection.all_cells(seeds=1)}
     assert len(runs) == 7
     for run in runs:
-        assert (evidence.selection.config_of(run, tmp_path).replay is not None) == (run.cure == "replay")
+        assert (evidence.selection.make_config(run, tmp_path).replay is not None) == (run.cure == "replay")
     evidence.tables.draw(stored, tmp_path / "plot.png")
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_labs_differ_and_a_third_has_a_special_condition(evidence: Any) -> None:
+    labs = [evidence.labs.lab_of(number) for number in range(1, evidence.labs.LABS + 1)]
+    assert len({lab.domain.camera for lab in labs}) == len({cell.name for cell in evidence.labs.all_cells()}) // 6 == 12
+    assert [lab.condition == "new camera" for lab in labs].count(False) == 4
+    assert labs[4] == evidence.labs.lab_of(5)
+
+
+def test_advice_table_counts_helpful_and_harmful_adaptation(evidence: Any) -> None:
+    tables, methods = evidence.labs_tables, evidence.labs.METHODS
+
+    def trained(ends: float, *, selected: int, conclusion: str) -> dict[str, Any]:
+        name = "newest" if selected == 400 else "selected"
+        verdicts = {"newest": {"verdicts": {"better action ranking": {"conclusion": conclusion}}}}
+        verdicts[name] = verdicts["newest"]
+        loops = {"newest": [ends] * 20}
+        return {"selected": f"step-{selected:08d}", "evaluation": verdicts, "closed_loop": loops}
+
+    base = {"closed_loop": {"newest": [1.0] * 10 + [9.0] * 10}}  # 50 %
+    helpful, harmful = trained(1.0, selected=400, conclusion="yes"), trained(9.0, selected=0, conclusion="no")
+    lab = dict.fromkeys(methods, helpful) | {methods[0]: base, "full fine-tuning": harmful}
+    rows = {line.split("|")[1].strip(): line for line in tables.advice_table({7: lab}).splitlines()}
+    assert "| 2 of 2 | 0 of 1 | 16.7 points | 67 % |" in rows["always adapt"]
+    assert "| 0 of 2 | 1 of 1 | 33.3 points | 50 % |" in rows["never adapt"]
+    assert "| 2 of 2 | 1 of 1 | 0.0 points | 83 % |" in rows["selected checkpoint (`keep_best`)"]
+    gains = {line.split("|")[1].strip(): line for line in tables.gains_table({7: lab}).splitlines()}
+    assert "| 0 % of 1 |" in gains["full fine-tuning"]
+    assert "| -50 points | -50 points |" in gains["full fine-tuning"]
+
+
+def test_adapting_planner_trains_on_its_transitions_only_from_the_second_decision(evidence: Any) -> None:
+    labs = evidence.labs
+    model = labs.load_base(labs.ModelConfig(base=labs.BUILTIN, dtype="float32"), seed=0).eval()
+    policy = labs.AdaptingPlanner(model, rate=1e-2)
+    policy.planning.controller.config = labs.PLANNING
+    before = [weight.detach().clone() for weight in policy.parameters]
+    spec = labs.BenchmarkOptions("reach", "A", 1, 0, steps=2)
+    labs.run_task(spec, policy)
+    assert len(policy.transitions) == 1
+    changed = [not bool((now == then).all()) for now, then in zip(policy.parameters, before, strict=True)]
+    assert any(changed)
+    frozen = model.base_predictor.blocks[0].state_dict()
+    assert all(
+        bool((frozen[key] == value).all()) for key, value in policy.model.base_predictor.blocks[0].state_dict().items()
+    )
