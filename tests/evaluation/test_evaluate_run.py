@@ -220,6 +220,11 @@ def test_model_without_data_missing_checkpoint_and_file_as_output_folder_raise(
         evaluate_subject(run, make_options(out=tmp_path / "file"))
 
 
+def test_model_without_data_is_called_a_model() -> None:
+    with pytest.raises(InputError, match=r"builtin:sim-tiny: a model.* add --data CONFIG"):
+        evaluate_subject("builtin:sim-tiny", EvaluationOptions())
+
+
 # ---- with a decoder ----
 
 

@@ -15,6 +15,7 @@ from vjepa2_ac.errors import InputError, counted
 from vjepa2_ac.planning.settings import resolve_data_limits
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, SELECTED, checkpoint_name, select_checkpoint
 from vjepa2_ac.runs.folder import is_run, read_run_config, sets_movable_path
+from vjepa2_ac.storage.paths import BUILTIN
 
 
 @dataclass(frozen=True)
@@ -97,12 +98,12 @@ def _select_config(subject: str, options: EvaluationOptions) -> Config:
             if Path(subject).is_file() and Path(subject).suffix in {".yaml", ".yml"}:
                 fix = "Pass the folder that run_dir in this config names"
                 raise InputError(where=subject, found="a config file", needed="the folder of a run", fix=fix)
-            raise InputError(
-                where=subject,
-                found="no config.yaml: not the folder of a run" if Path(subject).exists() else "no such folder",
-                needed="the folder of a run, which `vjepa2-ac train CONFIG` creates",
-                fix="For a model instead of a run, add --data CONFIG; `evaluate` also needs --out FOLDER",
-            )
+            problem = "no such folder"
+            if subject.startswith(BUILTIN) or Path(subject).exists():
+                problem = "a model, or a folder without config.yaml"
+            fix = "For a model, add --data CONFIG; `evaluate` also needs --out FOLDER"
+            needed = "the folder of a run, which `vjepa2-ac train CONFIG` creates"
+            raise InputError(where=subject, found=problem, needed=needed, fix=fix)
         return run_config
     if options.out is None:
         problem, needed = "no output folder", "one, since metrics.json in a run's folder is that of the run's own data"
