@@ -206,7 +206,7 @@ def test_invalid_input_is_reported_before_a_model_is_loaded(
 def test_model_without_data_missing_checkpoint_and_file_as_output_folder_raise(
     run: str, tmp_path: Path, base_folder: Path
 ) -> None:
-    with pytest.raises(InputError, match=r"no config\.yaml.*--data CONFIG"):
+    with pytest.raises(InputError, match=r"a model, or a folder without config\.yaml.*--data CONFIG"):
         evaluate_subject(str(base_folder), make_options())
     with pytest.raises(InputError, match="no such folder"):
         evaluate_subject(str(tmp_path / "nowhere"), make_options())
