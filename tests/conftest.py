@@ -65,12 +65,12 @@ SLOW = (
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Sort the longest files first, and mark slow tests."""
-    places = {name: place for place, name in enumerate(LONGEST)}
+    ranks = {name: rank for rank, name in enumerate(LONGEST)}
     for item in items:
         name = os.path.relpath(item.path, ROOT / "tests")
         if name.startswith(SLOW) or "test_installed_environment_is_solved" in item.name:
             item.add_marker(pytest.mark.slow)
-    items.sort(key=lambda item: places.get(item.path.name, len(places)))
+    items.sort(key=lambda item: ranks.get(item.path.name, len(ranks)))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -48,7 +48,7 @@ def test_api_page_lists_exactly_the_public_names() -> None:
 def test_api_page_shows_the_parameters_of_each_function(name: str) -> None:
     (shown,) = re.findall(rf"^\| `{name}\((.*?)\)`", PAGE, flags=re.MULTILINE)
     parameters = inspect.signature(getattr(vjepa2_ac, name)).parameters.values()
-    assert re.findall(r"\w+", shown) == [one.name for one in parameters]
+    assert re.findall(r"\w+", shown) == [parameter.name for parameter in parameters]
     assert len(parameters) <= 6
 
 
@@ -149,8 +149,8 @@ def test_run_and_exported_adapter_give_equal_predictions(make_config: MakeConfig
     assert load_run(folder, 10).checkpoint == run.checkpoint
     hub = export_run(folder, tmp_path / "hub", "hub", "best").path
     exported = load_model(str(run.config.model.base), adapter=hub, dtype="float32")
-    given = torch.randn(1, 2, exported.num_tokens, exported.latent_dim), torch.ones(1, 2, 7), torch.ones(1, 2, 7)
-    torch.testing.assert_close(exported.predict(*given), run.world_model.predict(*given), rtol=0, atol=0)
+    inputs = torch.randn(1, 2, exported.num_tokens, exported.latent_dim), torch.ones(1, 2, 7), torch.ones(1, 2, 7)
+    torch.testing.assert_close(exported.predict(*inputs), run.world_model.predict(*inputs), rtol=0, atol=0)
     with pytest.raises(UserError, match=r"load_model\(BASE, adapter=FOLDER\)"):
         load_run(hub)
     with pytest.raises(UserError, match="no such folder"):
@@ -177,14 +177,14 @@ def test_open_dataset_applies_config_and_keyword_arguments(simulated: Path) -> N
 def test_frames_and_batches_have_the_same_latents(simulated: Path) -> None:
     model = load_model(TINY)
     batch = next(read_clips(open_dataset(simulated, frames=2), clips=2))
-    seen = encode(model, batch)
+    encoded = encode(model, batch)
     assert batch.frames is not None
     of_frames = encode(model, batch.frames.numpy())
     assert tuple(of_frames.shape) == (2, 2, 36, 128)
-    torch.testing.assert_close(of_frames, seen.latents)
+    torch.testing.assert_close(of_frames, encoded.latents)
     image = encode(model, batch.frames.numpy()[1, 0])
     assert tuple(image.shape) == (36, 128)
-    torch.testing.assert_close(image, seen.latents[1, 0], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(image, encoded.latents[1, 0], rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("frames", [np.zeros((4, 4, 3)), np.zeros((4, 4), np.uint8), np.zeros((3, 4, 4), np.uint8)])

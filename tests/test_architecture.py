@@ -51,8 +51,8 @@ simulation: domains droid_writer < motion camera < arm < tasks < rollout < polic
 """
 ORDERS = {"": LAYERS}
 for line in LAYERS_WITHIN.strip().splitlines():
-    room, _, order = line.partition(": ")
-    ORDERS[room] = order.split("<")
+    package, _, order = line.partition(": ")
+    ORDERS[package] = order.split("<")
 
 ALLOWED_IMPORTERS = {
     "PIL": ["media/"],
@@ -92,11 +92,11 @@ MAX_FILES = 16  # in one folder, `__init__` included
 @cache
 def modules() -> dict[str, Path]:
     """Every module by its name within the package; the package itself is `__init__`."""
-    found = {}
+    paths = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
-        found[name if name == "__init__" else name.removesuffix(".__init__")] = path
-    return found
+        paths[name if name == "__init__" else name.removesuffix(".__init__")] = path
+    return paths
 
 
 @cache
@@ -107,28 +107,28 @@ def tree_of(path: Path) -> ast.Module:
 @cache
 def imports_of(path: Path) -> frozenset[str]:
     """Every module or name that a file imports, dotted."""
-    found = set()
+    imports = set()
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            imports |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: imports are absolute"
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+            imports |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "require_library":
-            found |= {word.value for word in node.args if isinstance(word, ast.Constant)}
-    return frozenset(found)
+            imports |= {word.value for word in node.args if isinstance(word, ast.Constant)}
+    return frozenset(imports)
 
 
 def own_imports(path: Path) -> set[str]:
     """The modules of this package that a file imports; the package itself names its public ones for type checkers."""
-    found: set[str] = set()
+    imported: set[str] = set()
     if path == PACKAGE / "__init__.py":
-        return found
+        return imported
     for name in imports_of(path):
         package, _, rest = name.partition(".")
         if package == "vjepa2_ac":
-            found.add(rest if rest in modules() else rest.rpartition(".")[0] or "__init__")
-    return found
+            imported.add(rest if rest in modules() else rest.rpartition(".")[0] or "__init__")
+    return imported
 
 
 def package_within(folder: str, module: str) -> str | None:
@@ -141,17 +141,17 @@ def package_within(folder: str, module: str) -> str | None:
 def test_package_imports_only_lower_packages() -> None:
     wrong = []
     for folder, order in ORDERS.items():
-        rank = {room: place for place, line in enumerate(order) for room in line.split()}
+        rank = {package: level for level, line in enumerate(order) for package in line.split()}
         for module, path in modules().items():
-            room = package_within(folder, module)
-            if room is None:
+            package = package_within(folder, module)
+            if package is None:
                 continue
-            if room not in rank:
+            if package not in rank:
                 wrong.append(f"{module}: not in the order of {folder or 'the package'}")
                 continue
             for other_module in own_imports(path):
                 other = package_within(folder, other_module)
-                if other is not None and other != room and rank.get(other, -1) >= rank[room]:
+                if other is not None and other != package and rank.get(other, -1) >= rank[package]:
                     wrong.append(f"{module} imports {other_module}")
     assert not wrong, "\n".join(sorted(wrong))
 
@@ -161,8 +161,10 @@ def test_imports_between_packages_have_no_cycle() -> None:
     for folder in {""} | {name.rpartition(".")[0] for name in modules() if "." in name}:
         arrows: defaultdict[str, set[str]] = defaultdict(set)
         for module, path in modules().items():
-            if room := package_within(folder, module):
-                arrows[room] |= {other for one in own_imports(path) if (other := package_within(folder, one))} - {room}
+            if package := package_within(folder, module):
+                arrows[package] |= {
+                    other for imported in own_imports(path) if (other := package_within(folder, imported))
+                } - {package}
         TopologicalSorter(arrows).prepare()  # its error names the circle
 
 
@@ -192,7 +194,7 @@ def test_heavy_libraries_are_imported_in_allowed_modules_only() -> None:
 
 EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 LIBRARIES_OF_EXTRAS = {  # the libraries that each extra of the program brings, by name
-    extra: {re.split(r"[\[<>=]", one)[0] for one in needed}
+    extra: {re.split(r"[\[<>=]", requirement)[0] for requirement in needed}
     for extra, needed in EXTRAS.items() if extra not in {"data", "dev", "docs"}
 }  # fmt: skip
 
@@ -204,27 +206,27 @@ def test_modules_can_be_imported_without_extras() -> None:
         f"for name in {sorted(set(modules()) - {'__init__', 'cli.__main__'})}:\n"
         "    importlib.import_module(f'vjepa2_ac.{name}')\n"
     )
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-600:]
+    process = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr[-600:]
 
 
 def test_install_hint_names_an_extra_with_the_library() -> None:
-    asked, wrong = 0, []
+    num_checked, wrong = 0, []
     for module, path in modules().items():
         for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "require_library":
                 named = {word.arg: word.value.value for word in node.keywords if isinstance(word.value, ast.Constant)}
                 library = node.args[0].value if isinstance(node.args[0], ast.Constant) else "websockets"  # serve's loop
-                asked += 1
+                num_checked += 1
                 if str(library).split(".")[0] not in {
-                    one.replace("-", "_") for one in LIBRARIES_OF_EXTRAS.get(str(named["extra"]), ())
+                    requirement.replace("-", "_") for requirement in LIBRARIES_OF_EXTRAS.get(str(named["extra"]), ())
                 }:
                     wrong.append(f"{module}: {library}: {named['extra']}")
-    assert asked > 5
+    assert num_checked > 5
     assert not wrong
 
 
 def test_modules_do_not_import_the_public_names() -> None:
     """Otherwise the test of the layers would miss these imports."""
     public = {f"vjepa2_ac.{name}" for name in vjepa2_ac.__all__}
-    assert not {module: found for module, path in modules().items() if (found := imports_of(path) & public)}
+    assert not {module: imported for module, path in modules().items() if (imported := imports_of(path) & public)}

@@ -54,7 +54,7 @@ def is_module_or_part_of_one(dotted: str) -> bool:
     return True
 
 
-GROUPS = {one.group for one in REGISTRIES}  # entry points, which look like modules
+GROUPS = {registry.group for registry in REGISTRIES}  # entry points, which look like modules
 
 
 def is_config_key(dotted: str) -> bool:
@@ -67,8 +67,8 @@ def test_named_files_exist() -> None:
     for path in TODAY:
         text = re.sub(r"Source: .*?(?=\n\s*\n|\"\"\"|\Z)", "", path.read_text(), flags=re.DOTALL)
         named = re.findall(r"(?<![\w./~-])((?:[a-z_]+/)+[A-Za-z_]+\.(?:py|md|yaml|png|sh|txt))\b", text)
-        ours = [name for name in named if name.split("/")[0] in OURS]
-        wrong += [f"{path.relative_to(ROOT)}: {name}" for name in ours if not file_exists(name)]
+        repository_files = [name for name in named if name.split("/")[0] in OURS]
+        wrong += [f"{path.relative_to(ROOT)}: {name}" for name in repository_files if not file_exists(name)]
     assert not wrong, "\n".join(wrong)
 
 
@@ -108,7 +108,7 @@ def test_no_text_installs_the_package_by_name_alone() -> None:
     names = [*ROOT.glob("*.md"), *(path for folder in TEXTS for path in (ROOT / folder).rglob("*"))]
     texts = {path: path.read_text() for path in names if path.suffix in SUFFIXES}
     bare = re.compile(r"""pip\S* install[^\n`#]*[\s"']vjepa2[-_]ac(?:\[[\w,]+\])?["'`\s](?!@)""")
-    assert not {path.name: found for path, text in texts.items() if (found := bare.findall(text))}
+    assert not {path.name: commands for path, text in texts.items() if (commands := bare.findall(text))}
     assert bare.search('pip install "vjepa2-ac[sim]"')
     assert bare.search("pip install -U vjepa2-ac\n")
     assert not bare.search('pip install "vjepa2-ac[sim] @ file:///x.whl"')

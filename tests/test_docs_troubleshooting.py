@@ -22,7 +22,7 @@ OF_A_RUN = ("data.test_share=0.3", *FEW_STEPS.split())
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def working_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make what the commands of the page find."""
     folder = tmp_path_factory.mktemp("troubles")
     with pytest.MonkeyPatch.context() as patch:
@@ -41,12 +41,16 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(("command", "message"), SHOWN, ids=[command for command, _ in SHOWN])
 def test_troubleshooting_page_shows_the_printed_errors(
-    command: str, message: str, place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str,
+    message: str,
+    working_folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     if any(command.startswith(start) for start in NOT_MADE):
         assert message.startswith("error: ")
         return
-    monkeypatch.chdir(place)
+    monkeypatch.chdir(working_folder)
     assert main([*shlex.split(command), *(OF_A_RUN if "run_dir=runs/ten" in command else ())]) == 2
     printed = " ".join(capsys.readouterr().err.split())
     expected = re.escape(" ".join(message.split())).replace("…", ".*?")

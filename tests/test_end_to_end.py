@@ -83,14 +83,14 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize(("arguments", "complaint"), WRONG.values(), ids=WRONG.keys())
+@pytest.mark.parametrize(("arguments", "message"), WRONG.values(), ids=WRONG.keys())
 def test_wrong_input_prints_one_error(
-    workshop: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], complaint: str
+    workshop: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     assert main([word.format(here=workshop) for word in arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
-    assert complaint in error
+    assert message in error
     assert "Traceback" not in error
     assert not (workshop / "x").exists()
 

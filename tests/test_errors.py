@@ -105,12 +105,12 @@ def test_printed_command_quotes_special_characters(tmp_path: Path) -> None:
 def test_printed_commands_quote_paths() -> None:
     package = Path(vjepa2_ac.__file__).parent
     allowed = {"data converter {name}", "download {one.name}", "download {model.name}"}  # names of this package
-    found = [
+    commands = [
         f"{path.relative_to(package)}: {command}"
         for path in package.rglob("*.py")
         for command in re.findall(r"vjepa2-ac ([a-z]+ [^`\"\n]*?\{[^}]*\})", path.read_text())
     ]
-    assert [one for one in found if one.partition(": ")[2] not in allowed] == []
+    assert [entry for entry in commands if entry.partition(": ")[2] not in allowed] == []
 
 
 @pytest.mark.parametrize(

@@ -35,10 +35,10 @@ def test_look_at_data_records_episodes_once_and_draws_a_sheet(
     simulated: Path,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    asked: list[dict[str, Any]] = []
+    calls: list[dict[str, Any]] = []
 
     def recorded(folder: Path, _spec: object, **options: Any) -> None:
-        asked.append(options)
+        calls.append(options)
         folder.parent.mkdir(parents=True)
         folder.symlink_to(simulated)
 
@@ -46,7 +46,7 @@ def test_look_at_data_records_episodes_once_and_draws_a_sheet(
     monkeypatch.setitem(main.__globals__, "record_dataset", recorded)
     main()
     main()  # a second look finds them
-    assert [options["episodes"] for options in asked] == [12]
+    assert [options["episodes"] for options in calls] == [12]
     printed = capsys.readouterr().out
     assert printed.count("8 episodes, ") == 2
     assert "(4, 4, 180, 243, 3): clips, time, height, width, RGB" in printed
@@ -57,7 +57,7 @@ def test_look_at_data_records_episodes_once_and_draws_a_sheet(
 def test_predict_example_is_better_than_persistence(capsys: pytest.CaptureFixture[str]) -> None:
     main_of("predict")()
     ratios = [
-        float(found) for found in re.findall(r"s ahead.* (\d\.\d+)$", capsys.readouterr().out, flags=re.MULTILINE)
+        float(number) for number in re.findall(r"s ahead.* (\d\.\d+)$", capsys.readouterr().out, flags=re.MULTILINE)
     ]
     assert len(ratios) == 3
     assert max(ratios) < 1
@@ -76,7 +76,7 @@ def test_plan_in_a_loop_example_approaches_the_goal(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     main_of("plan_in_a_loop")(samples=40, steps=2)
-    distances = [float(found) for found in re.findall(r"([\d.]+) cm from", capsys.readouterr().out)]
+    distances = [float(number) for number in re.findall(r"([\d.]+) cm from", capsys.readouterr().out)]
     assert len(distances) == 3
     assert distances[-1] < distances[0]
     film = read_image("demo/examples/plan_in_a_loop.png")

@@ -67,10 +67,10 @@ def predictions(model: WorldModel) -> Tensor:
         return model.rollout(latents[:, :1], actions, states)
 
 
-def assert_predicts_as(found: WorldModel, run: Path) -> None:
+def assert_predicts_as(world_model: WorldModel, run: Path) -> None:
     model = load_subject(run).world_model
     expected = predictions(model)
-    assert (predictions(found) - expected).abs().max() <= 1e-5 * expected.abs().max()
+    assert (predictions(world_model) - expected).abs().max() <= 1e-5 * expected.abs().max()
     with use_base_weights(model):
         assert (predictions(model) - expected).abs().max() > 1e-3, "training changed nothing: this compares nothing"
 
@@ -219,9 +219,9 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("form", ["merged", "official", "hub"])
 def test_unusable_destination_raises_before_the_export(tmp_path: Path, form: Any) -> None:
     (tmp_path / "there.pt").write_text("precious")
-    for place in (tmp_path, tmp_path / "there.pt"):
+    for destination in (tmp_path, tmp_path / "there.pt"):
         with pytest.raises(InputError, match=r"a file with this name exists|not empty|ends in \.pt"):
-            export_run(tmp_path / "run", place, form)
+            export_run(tmp_path / "run", destination, form)
     assert (tmp_path / "there.pt").read_text() == "precious"
     with pytest.raises(InputError, match="cannot be written"):
         export_run(tmp_path / "run", tmp_path / "there.pt" / "below", form)

@@ -42,13 +42,13 @@ def command(*words: str) -> subprocess.CompletedProcess[str]:
 
 def test_training_imports_core_packages_only() -> None:
     code = "import sys, vjepa2_ac.training.loop; print(*(name for name in sys.modules if name.startswith('vjepa2_ac')))"
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
-    assert done.stderr == "", "libraries say nothing when they are imported"
-    loaded = done.stdout.split()
+    process = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert process.stderr == "", "libraries say nothing when they are imported"
+    loaded = process.stdout.split()
     assert "vjepa2_ac.model.lora" in loaded
-    rooms = {name.split(".")[1] for name in loaded if "." in name}
+    packages = {name.split(".")[1] for name in loaded if "." in name}
     beside = "simulation init serving inspection calibration goals policies console cli export"
-    assert not rooms & set(beside.split())
+    assert not packages & set(beside.split())
 
 
 def test_plugin_loss_planner_and_energy_work_from_yaml(at_home: Path, make_config) -> None:
@@ -90,11 +90,11 @@ def test_plugin_options_and_names_are_validated_with_the_config(at_home: Path, m
         ("planning.energy.distance=larges", "Did you mean largest?"),
         ("planning.planner.options={a: 1}", "available: start_std, elites"),
     )
-    for override, told in wrong:
+    for override, message in wrong:
         words = ["config", "show", "own.yaml", "--plugin", "my_module", "training.loss=log_cosh", override]
         shown = command(*words)
         assert shown.returncode == 2, override
-        assert told in shown.stderr, shown.stderr
+        assert message in shown.stderr, shown.stderr
     missing = command("config", "show", "own.yaml", "--plugin", "my_modul")
     assert (missing.returncode, "no such module" in missing.stderr) == (2, True)
 
@@ -119,9 +119,9 @@ def installed(at_home: Path, entry_points: str, code: str, *words: str) -> subpr
 def test_installed_plugin_is_found_by_its_entry_point(at_home: Path, make_config) -> None:
     (at_home / "own.yaml").write_text(as_yaml(make_config()))
     words = ["config", "show", "own.yaml", "training.loss=log_cosh", "training.loss.options={scale: 3}"]
-    done = installed(at_home, "[vjepa2_ac.losses]\nlog_cosh = my_package:LogCosh\n", recipes("A loss"), *words)
-    assert done.returncode == 0, done.stderr
-    assert yaml.safe_load(done.stdout)["training"]["loss"]["options"] == {"scale": 3}
+    process = installed(at_home, "[vjepa2_ac.losses]\nlog_cosh = my_package:LogCosh\n", recipes("A loss"), *words)
+    assert process.returncode == 0, process.stderr
+    assert yaml.safe_load(process.stdout)["training"]["loss"]["options"] == {"scale": 3}
 
 
 def test_plugin_data_source_is_recognized_trained_and_evaluated(at_home: Path, base_folder: Path) -> None:
@@ -132,8 +132,8 @@ def test_plugin_data_source_is_recognized_trained_and_evaluated(at_home: Path, b
         states[:, number % 3] = np.linspace(0.3, 0.5, 24)
         np.savetxt(data / f"{number}.wall", states)
     plugin = ["--plugin", "my_module"]
-    begun = command("init", "walls", "--model", str(base_folder), "--out", "own.yaml", *plugin)
-    assert begun.returncode == 0, begun.stdout + begun.stderr
+    process = command("init", "walls", "--model", str(base_folder), "--out", "own.yaml", *plugin)
+    assert process.returncode == 0, process.stdout + process.stderr
     values = yaml.safe_load((at_home / "own.yaml").read_text())
     assert (values["data"]["source"], values["data"]["camera"]) == ("wall", "front")
 

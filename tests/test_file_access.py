@@ -115,12 +115,12 @@ def test_pipe_device_or_folder_in_place_of_a_file_raises_at_once(files: Path, na
         (files / name).symlink_to("/dev/zero")
     else:
         (files / name).mkdir()
-    found = "Is a directory" if kind == "folder" else "a pipe or a device"
-    with pytest.raises(InputError, match=f"{re.escape(name)}: .*{found}"):
+    description = "Is a directory" if kind == "folder" else "a pipe or a device"
+    with pytest.raises(InputError, match=f"{re.escape(name)}: .*{description}"):
         READERS[name](files)
 
 
-@pytest.mark.parametrize("name", sorted(one for one in READERS if one.endswith(".safetensors")))
+@pytest.mark.parametrize("name", sorted(reader for reader in READERS if reader.endswith(".safetensors")))
 @pytest.mark.parametrize("dtype", [torch.float8_e4m3fn, torch.int64, torch.bool, torch.complex64])
 def test_weights_of_unsupported_type_raise(files: Path, name: str, dtype: torch.dtype) -> None:
     weights = load_file(files / name)
@@ -140,8 +140,8 @@ def test_checkpoint_weights_of_unsupported_type_raise(tmp_path: Path, part: str,
     value = parts[part][name]
     parts[part][name] = value.to_sparse() if dtype == "sparse" else value.to(dtype)
     torch.save(parts, tmp_path / "odd.pt")
-    found = rf"odd\.pt: {part}: {re.escape(name.removeprefix('module.'))} has type torch\."
-    with pytest.raises(InputError, match=rf"{found}.*Expected dense weights"):
+    description = rf"odd\.pt: {part}: {re.escape(name.removeprefix('module.'))} has type torch\."
+    with pytest.raises(InputError, match=rf"{description}.*Expected dense weights"):
         load_official(tmp_path / "odd.pt", SIZES)
 
 

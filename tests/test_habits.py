@@ -45,8 +45,11 @@ def test_every_dependency_has_exactly_one_pin() -> None:
     pins = [canonical(line.split("==")[0]) for line in lines]
     assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in lines)
     assert len(pins) == len(set(pins))
-    asked = [*PROJECT["dependencies"], *(one for extra in PROJECT["optional-dependencies"].values() for one in extra)]
-    names = {canonical(re.split(r"[\[<>=]", one)[0]) for one in asked} - {"vjepa2-ac"}
+    requirements = [
+        *PROJECT["dependencies"],
+        *(requirement for extra in PROJECT["optional-dependencies"].values() for requirement in extra),
+    ]
+    names = {canonical(re.split(r"[\[<>=]", requirement)[0]) for requirement in requirements} - {"vjepa2-ac"}
     assert not (names | {"pip-audit", "build", "twine"}) - set(pins)
 
 
@@ -58,7 +61,7 @@ def test_ported_sources_are_in_the_notice() -> None:
     for path in sorted((ROOT / "src").rglob("*.py")):
         for block in SOURCE.findall(path.read_text()):
             text = re.sub(r"\s+", " ", block)
-            names = [found[0] for found in NAMED.finditer(text)]
+            names = [match[0] for match in NAMED.finditer(text)]
             missing = [name for name in names if name not in notice] if names else ["names nobody"]
             wrong += [f"{path.relative_to(ROOT)}: {name}: {text}" for name in missing]
     assert not wrong, "\n".join(wrong)

@@ -31,8 +31,8 @@ def test_interval_coverage_equals_the_stated_rate(episodes: int) -> None:
         levels = rng.normal(0.7, 0.1, size=episodes)  # episodes differ; clips of one episode are similar
         errors = np.repeat(levels, 4) + rng.normal(0, 0.02, size=4 * episodes)
         columns = np.stack([errors, np.ones(4 * episodes)])[:, :, None]
-        (found,) = bootstrap(lambda sums: sums[0] / sums[1], columns, ids)
-        covered += found.low <= 0.7 <= found.high
+        (interval,) = bootstrap(lambda sums: sums[0] / sums[1], columns, ids)
+        covered += interval.low <= 0.7 <= interval.high
     assert covered / 400 == pytest.approx(0.95, abs=0.035)
 
 
@@ -48,15 +48,15 @@ def test_shared_episode_difficulty_does_not_widen_the_difference() -> None:
 def test_interval_level_is_widened_for_few_episodes() -> None:
     """Quantiles of a uniform distribution are their levels: here Phi(-sqrt(n / (n - 1)) t), with Student's t, n - 1."""
     for episodes, student in ((2, 12.7062), (5, 2.77645), (30, 2.04523)):
-        (found,) = bootstrap_by_weights(lambda weights: np.linspace(0, 1, len(weights))[:, None], episodes)
+        (interval,) = bootstrap_by_weights(lambda weights: np.linspace(0, 1, len(weights))[:, None], episodes)
         level = stats.norm.cdf(-math.sqrt(episodes / (episodes - 1)) * student)
-        assert (found.low, found.high) == pytest.approx((level, 1 - level), rel=1e-3)
+        assert (interval.low, interval.high) == pytest.approx((level, 1 - level), rel=1e-3)
 
 
 def test_bootstrap_draws_whole_episodes() -> None:
     """With two episodes a draw has one of them twice, or both, so the interval spans both values."""
-    found = estimate_mean(np.array([1.0, 1.0, 5.0]), ("a", "a", "b"))
-    assert (found.low, found.value, found.high) == pytest.approx((1.0, 7 / 3, 5.0), abs=0.01)
+    interval = estimate_mean(np.array([1.0, 1.0, 5.0]), ("a", "a", "b"))
+    assert (interval.low, interval.value, interval.high) == pytest.approx((1.0, 7 / 3, 5.0), abs=0.01)
 
 
 def test_single_episode_has_no_interval_and_nan_is_none_in_json() -> None:
@@ -78,9 +78,9 @@ def test_bootstrap_by_weights_equals_bootstrap_of_sums() -> None:
     rng = np.random.default_rng(3)
     values, ids = rng.random(12), [f"episode {clip % 4}" for clip in range(12)]
     sums = values.reshape(3, 4).sum(axis=0)
-    (found,) = bootstrap_by_weights(lambda weights: (weights @ sums / (3 * weights.sum(axis=1)))[:, None], 4)
+    (interval,) = bootstrap_by_weights(lambda weights: (weights @ sums / (3 * weights.sum(axis=1)))[:, None], 4)
     expected = estimate_mean(values, ids)
-    assert (found.value, found.low, found.high) == pytest.approx((expected.value, expected.low, expected.high))
+    assert (interval.value, interval.low, interval.high) == pytest.approx((expected.value, expected.low, expected.high))
     (alone,) = bootstrap_by_weights(lambda weights: weights, 1)
     assert alone.value == 1
     assert not alone.has_interval

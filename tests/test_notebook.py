@@ -37,8 +37,8 @@ def executed(folder: Path) -> tuple[str, int]:
     resources = {"metadata": {"path": str(folder / "examples")}}
     NotebookClient(notebook, timeout=600, kernel_name="python3", resources=resources).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
-    said = "".join(output.text for output in outputs if output.get("name") == "stderr")
-    assert set(said.splitlines()) <= {UNTRAINED}
+    stderr = "".join(output.text for output in outputs if output.get("name") == "stderr")
+    assert set(stderr.splitlines()) <= {UNTRAINED}
     images = sum("image/png" in output.get("data", {}) for output in outputs)
     return "".join(output.get("text", "") for output in outputs), images
 

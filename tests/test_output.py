@@ -100,7 +100,7 @@ def test_closed_streams_are_not_reused_by_files(tmp_path: Path, closed: tuple[in
 
 
 def test_closed_terminal_is_no_error(start: Start) -> None:
-    ours, theirs = pty.openpty()
+    controller_fd, terminal_fd = pty.openpty()
     code = """
     print(sys.stdout.isatty(), flush=True)
     sys.stdin.readline()
@@ -108,13 +108,13 @@ def test_closed_terminal_is_no_error(start: Start) -> None:
         print("nobody there")
     assert not lost()
 """
-    process = start(code, stdin=subprocess.PIPE, stdout=theirs, stderr=theirs)
-    os.close(theirs)
-    said = b""
-    while not said.endswith(b"\n"):
-        said += os.read(ours, 100)
-    assert said == b"True\r\n", "it is known to be one"
-    os.close(ours)
+    process = start(code, stdin=subprocess.PIPE, stdout=terminal_fd, stderr=terminal_fd)
+    os.close(terminal_fd)
+    printed = b""
+    while not printed.endswith(b"\n"):
+        printed += os.read(controller_fd, 100)
+    assert printed == b"True\r\n", "it is known to be one"
+    os.close(controller_fd)
     process.communicate(b"go\n", timeout=120)
     assert process.returncode == 0
 
@@ -127,9 +127,9 @@ def test_both_streams_on_one_file_keep_their_order_and_all_text(start: Start) ->
 """
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     process = start(code, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment)
-    said, _ = process.communicate(timeout=120)
+    printed, _ = process.communicate(timeout=120)
     assert process.returncode == 0
-    assert said.split() == [
+    assert printed.split() == [
         *(str(number).encode() for number in range(100)),
         rb"Gr\xfc\xdfe",
         rb"\udcff",

@@ -30,12 +30,12 @@ def official(request: pytest.FixtureRequest) -> dict[str, np.ndarray]:
         }
 
 
-def assert_same_pose(found: np.ndarray, expected: np.ndarray, tolerance: float = 1e-9) -> None:
+def assert_same_pose(actual: np.ndarray, expected: np.ndarray, tolerance: float = 1e-9) -> None:
     """Compare positions and grippers as numbers, orientations as rotations."""
-    np.testing.assert_allclose(found[..., :3], expected[..., :3], atol=tolerance)
-    np.testing.assert_allclose(found[..., 6:], expected[..., 6:], atol=tolerance)
+    np.testing.assert_allclose(actual[..., :3], expected[..., :3], atol=tolerance)
+    np.testing.assert_allclose(actual[..., 6:], expected[..., 6:], atol=tolerance)
     np.testing.assert_allclose(
-        matrices_from_euler(found[..., 3:6]), matrices_from_euler(expected[..., 3:6]), atol=tolerance
+        matrices_from_euler(actual[..., 3:6]), matrices_from_euler(expected[..., 3:6]), atol=tolerance
     )
 
 
@@ -44,13 +44,13 @@ def test_actions_equal_official_actions(official: dict[str, np.ndarray]) -> None
 
 
 def test_camera_frame_equals_official_camera_frame(official: dict[str, np.ndarray]) -> None:
-    found = states_in_camera_frame(official["poses"], official["extrinsics"])
-    np.testing.assert_allclose(found, official["camera_frame"], atol=1e-9)
+    states = states_in_camera_frame(official["poses"], official["extrinsics"])
+    np.testing.assert_allclose(states, official["camera_frame"], atol=1e-9)
 
 
 def test_applied_actions_equal_official_poses(official: dict[str, np.ndarray]) -> None:
-    found = apply_action(official["poses"][:-1], official["deltas"])
-    assert_same_pose(found, official["composed"], 1e-6)
+    poses = apply_action(official["poses"][:-1], official["deltas"])
+    assert_same_pose(poses, official["composed"], 1e-6)
 
 
 @settings(max_examples=30)

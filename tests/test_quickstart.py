@@ -15,7 +15,7 @@ PAGE = (ROOT / "docs/QUICKSTART.md").read_text()
 SECTIONS = {
     int(number): text for number, text in re.findall(r"^## (\d)\. .*?\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.M)
 }
-HERE = (2, 3, 4)
+TESTED_SECTIONS = (2, 3, 4)
 
 
 def commands_of(section: int) -> list[list[str]]:
@@ -25,7 +25,7 @@ def commands_of(section: int) -> list[list[str]]:
 
 def test_quickstart_has_its_sections() -> None:
     assert list(SECTIONS) == [1, 2, 3, 4, 5, 6]
-    assert all(words[0] == "vjepa2-ac" for section in (*HERE, 5) for words in commands_of(section))
+    assert all(words[0] == "vjepa2-ac" for section in (*TESTED_SECTIONS, 5) for words in commands_of(section))
 
 
 def test_quickstart_commands_run_from_data_to_plan(
@@ -33,21 +33,21 @@ def test_quickstart_commands_run_from_data_to_plan(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     printed: dict[str, str] = {}
-    for words in [words for section in HERE for words in commands_of(section)]:
+    for words in [words for section in TESTED_SECTIONS for words in commands_of(section)]:
         assert main([*words[1:], *guides.shorter(" ".join(words))]) == 0, words
         printed[" ".join(words)] = capsys.readouterr().out
-    told = printed["vjepa2-ac init data/my_robot --model builtin:sim-tiny"]
-    walked = {" ".join(words) for words in commands_of(3)}
-    for line in re.findall(r"^  (vjepa2-ac .*?)   #", told, re.M):
-        assert line in walked, "init prints the page's commands"
+    init_output = printed["vjepa2-ac init data/my_robot --model builtin:sim-tiny"]
+    page_commands = {" ".join(words) for words in commands_of(3)}
+    for line in re.findall(r"^  (vjepa2-ac .*?)   #", init_output, re.M):
+        assert line in page_commands, "init prints the page's commands"
     shown = " ".join(printed["vjepa2-ac evaluate runs/my_robot"].split())
     assert re.search("error [0-9.]+ % (lower|higher) than (the base model's|that of persistence)", shown)
-    for made in ("my_robot.yaml", "inspection", "runs/my_robot/report.html", "runs/my_robot/metrics.json", "merged"):
-        assert (tmp_path / made).exists(), made
+    for name in ("my_robot.yaml", "inspection", "runs/my_robot/report.html", "runs/my_robot/metrics.json", "merged"):
+        assert (tmp_path / name).exists(), name
 
 
 def test_extras_named_in_quickstart_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    asked = [name for found in re.findall(r"\[([\w,]+)\]\"", SECTIONS[1]) for name in found.split(",")]
-    assert asked
-    assert set(asked) <= set(extras)
+    named_extras = [name for group in re.findall(r"\[([\w,]+)\]\"", SECTIONS[1]) for name in group.split(",")]
+    assert named_extras
+    assert set(named_extras) <= set(extras)

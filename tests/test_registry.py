@@ -26,9 +26,9 @@ REGISTERS = "from vjepa2_ac.registry import LOSSES\n\n@LOSSES.register({name!r})
 def _restored(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Forget what a test registers and imports."""
     modules, kinds, path = set(sys.modules), dict(DataConfig.kinds), sys.path[:]
-    for one in (LOSSES, doors.SOURCES):
+    for registry in (LOSSES, doors.SOURCES):
         for attribute in ("_things", "_origins"):
-            monkeypatch.setattr(one, attribute, getattr(one, attribute).copy())
+            monkeypatch.setattr(registry, attribute, getattr(registry, attribute).copy())
     monkeypatch.setattr(doors, "_registered", doors._registered[:])
     monkeypatch.setattr(doors, "_plugins", set(doors._plugins))
     yield
@@ -92,7 +92,7 @@ def test_entry_points_with_duplicate_names_raise(site: Path) -> None:
 def test_builtin_source_cannot_be_defined_again(site: Path) -> None:
     with pytest.raises(InputError, match=r"data format 'npz': already registered by vjepa2_ac\.config\.sources"):
 
-        class Again(DataConfig):
+        class DuplicateNpz(DataConfig):
             source: Literal["npz"] = "npz"
 
     leave_package(site, "p_npz", "[vjepa2_ac.sources]\nnpz = p_npz:thing\n")
@@ -159,14 +159,14 @@ def test_run_config_never_imports_from_the_working_directory(write: Write) -> No
     config = Path("run/config.yaml")
     config.write_text(as_yaml(parse_config(VALUES, where="")).replace("plugins: []", "plugins: [p_evil]"))
     Path("run/run_id").write_text("a")
-    read = (
+    loaders = (
         load_config,
         lambda path: load_planning_config(str(path.parent)),
         lambda path: load_planning_config("builtin:sim-tiny", config=path),
     )
-    for one in read:
+    for load in loaders:
         with pytest.raises(InputError, match=r"plugin 'p_evil': no such module.*--plugin p_evil"):
-            one(config)
+            load(config)
     assert "p_dist" not in LOSSES.names()
     assert not Path("PWNED").exists()
 
@@ -195,10 +195,10 @@ def test_installed_module_without_plugin_is_not_imported_for_a_run(write: Write,
     assert "antigravity" not in sys.modules
 
 
-@pytest.mark.parametrize("door", [load_config, lambda path: load_planning_config("builtin:sim-tiny", config=path)])
-def test_user_config_imports_from_the_working_directory(write: Write, door: Callable[[Path], object]) -> None:
+@pytest.mark.parametrize("load", [load_config, lambda path: load_planning_config("builtin:sim-tiny", config=path)])
+def test_user_config_imports_from_the_working_directory(write: Write, load: Callable[[Path], object]) -> None:
     config = Path("mine.yaml")
     write("p_mine")
     config.write_text(as_yaml(parse_config(VALUES, where="")).replace("plugins: []", "plugins: [p_mine]"))
-    door(config)
+    load(config)
     assert LOSSES.require_registered("p_mine")

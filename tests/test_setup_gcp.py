@@ -57,9 +57,9 @@ def machine(tmp_path: Path) -> Machine:
 
 
 def test_dry_run_prints_every_command_and_runs_none_even_without_gcloud(machine: Machine) -> None:
-    done = machine.run("--dry-run", "--login", *BUCKET)
-    assert done.returncode == 0, done.stderr
-    commands = [line[2:].replace("\\", "") for line in done.stdout.splitlines() if line.startswith("+ ")]
+    process = machine.run("--dry-run", "--login", *BUCKET)
+    assert process.returncode == 0, process.stderr
+    commands = [line[2:].replace("\\", "") for line in process.stdout.splitlines() if line.startswith("+ ")]
     assert [commands[0], *commands[2:]] == [LOGIN, LIST, CREATE]
     assert commands[1].startswith("curl --head")
     assert commands[1].endswith("/gresearch/robotics/droid/1.0.1/dataset_info.json")
@@ -71,10 +71,12 @@ def test_dry_run_prints_every_command_and_runs_none_even_without_gcloud(machine:
 def test_without_options_only_access_to_droid_is_checked(machine: Machine) -> None:
     assert os.access(SCRIPT, os.X_OK)
     machine.install("curl")
-    done = machine.run()
-    assert done.returncode == 0
-    assert "gcloud is not installed; only --login and --bucket need it. To install it, see https://cloud" in done.stdout
-    assert "DROID can be read" in done.stdout
+    process = machine.run()
+    assert process.returncode == 0
+    assert (
+        "gcloud is not installed; only --login and --bucket need it. To install it, see https://cloud" in process.stdout
+    )
+    assert "DROID can be read" in process.stdout
     assert [call.split()[0] for call in machine.calls] == ["curl"]
 
 
@@ -88,24 +90,24 @@ def test_bucket_is_created_once(machine: Machine) -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "words"),
+    ("gcloud_error", "words"),
     [
         ("HTTPError 409: The requested bucket name is not available.", "exists in another project.*another name"),
         ("HTTPError 403: billing is disabled", "could not be created:\n(?s:.*)HTTPError 403: billing is disabled"),
     ],
 )
-def test_failed_bucket_creation_is_explained(machine: Machine, answer: str, words: str) -> None:
-    machine.install("curl", "gcloud", create=answer)
-    done = machine.run(*BUCKET)
-    assert done.returncode == 1
-    assert re.search(words, done.stderr)
+def test_failed_bucket_creation_is_explained(machine: Machine, gcloud_error: str, words: str) -> None:
+    machine.install("curl", "gcloud", create=gcloud_error)
+    process = machine.run(*BUCKET)
+    assert process.returncode == 1
+    assert re.search(words, process.stderr)
     assert not machine.bucket.exists()
 
 
 def test_failed_step_is_named(machine: Machine) -> None:
     machine.install("curl", status=22)
-    done = machine.run()
-    assert (done.returncode, "DROID cannot be read from this machine" in done.stderr) == (1, True)
+    process = machine.run()
+    assert (process.returncode, "DROID cannot be read from this machine" in process.stderr) == (1, True)
     machine.install("curl")
     not_installed = "gcloud is not installed, and --login"
     for status, options, words in (
@@ -114,8 +116,8 @@ def test_failed_step_is_named(machine: Machine) -> None:
     ):  # fmt: skip
         if status:
             machine.install("gcloud", status=status)
-        done = machine.run(*options)
-        assert (done.returncode, words in done.stderr) == (1, True)
+        process = machine.run(*options)
+        assert (process.returncode, words in process.stderr) == (1, True)
 
 
 @pytest.mark.parametrize(
@@ -132,8 +134,8 @@ def test_failed_step_is_named(machine: Machine) -> None:
 )
 def test_wrong_options_are_named_and_no_command_runs(machine: Machine, options: list[str], words: str) -> None:
     machine.install("curl", "gcloud")
-    done = machine.run(*options)
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert "--help" in done.stderr
+    process = machine.run(*options)
+    assert process.returncode == 2
+    assert words in process.stderr
+    assert "--help" in process.stderr
     assert machine.calls == []

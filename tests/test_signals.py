@@ -118,16 +118,16 @@ def test_signal_handlers_are_restored() -> None:
 
 def test_signal_handlers_are_unchanged_outside_the_main_thread() -> None:
     before = signal.getsignal(signal.SIGTERM)
-    seen = []
+    observed = []
 
     def run() -> None:
         with stop_on_signals() as stop:
-            seen.extend([stop.reason, signal.getsignal(signal.SIGTERM)])
+            observed.extend([stop.reason, signal.getsignal(signal.SIGTERM)])
 
     thread = threading.Thread(target=run)
     thread.start()
     thread.join()
-    assert seen == [None, before]
+    assert observed == [None, before]
 
 
 def test_signal_while_data_is_unreachable_stops_before_the_step(

@@ -19,17 +19,17 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build as `make docs` does: a warning, such as a link that leads nowhere, is an error."""
     folder = tmp_path_factory.mktemp("site")
     words = ["-q", "-W", "--keep-going", "-b", "html", "-d", folder / "doctrees", ROOT / "docs", folder / "html"]
-    done = subprocess.run([sys.executable, "-m", "sphinx", *words], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-3000:]
+    process = subprocess.run([sys.executable, "-m", "sphinx", *words], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr[-3000:]
     return folder / "html"
 
 
 def test_pages_send_no_requests_and_search_works_from_a_file(site: Path, tmp_path: Path) -> None:
     page = tmp_path / "search.html"
     page.write_text(f'<meta http-equiv="refresh" content="0; url={(site / "search.html").as_uri()}?q=warmup">')
-    seen = open_page(page, tmp_path)
-    assert seen.requests == ()
-    assert "pages matching the search query" in seen.dom
+    opened = open_page(page, tmp_path)
+    assert opened.requests == ()
+    assert "pages matching the search query" in opened.dom
     assert (site / "made/api.html").read_text().count('<dt class="sig') > 11
 
 

@@ -56,10 +56,10 @@ def test_episode_in_other_units_names_the_likely_unit(scale: list[float], hints:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("place", [0, 4])
-def test_single_outlier_does_not_suggest_another_unit(place: int) -> None:
+@pytest.mark.parametrize("column", [0, 4])
+def test_single_outlier_does_not_suggest_another_unit(column: int) -> None:
     states = np.tile(STATES, (10, 1))
-    states[7, place] = 300.0
+    states[7, column] = 300.0
     with pytest.raises(InputError, match=r"step 7") as raised:
         POSE.require_plausible(states, "a.h5", fix="Check the fields")
     assert raised.value.fix == "Check the fields"
@@ -74,7 +74,7 @@ def test_vectors_need_finite_numbers_and_at_least_one_step() -> None:
 
 
 @pytest.mark.parametrize(
-    ("knobs", "widths", "effect"),
+    ("options", "widths", "effect"),
     [
         ({}, Widths(8, 8), "change"),
         ({"actions": "recorded", "join_actions": "sum"}, Widths(8, 8), "change"),
@@ -85,8 +85,8 @@ def test_vectors_need_finite_numbers_and_at_least_one_step() -> None:
         ({"actions": "recorded", "join_actions": "sum"}, Widths(8, 7), "unknown"),
     ],
 )
-def test_action_semantics_follow_the_config(knobs: dict[str, object], widths: Widths, effect: str) -> None:
-    spaces = get_spaces(DataConfig(path="d", source="npz", states="vector", **knobs), widths)
+def test_action_semantics_follow_the_config(options: dict[str, object], widths: Widths, effect: str) -> None:
+    spaces = get_spaces(DataConfig(path="d", source="npz", states="vector", **options), widths)
     assert (spaces.action.effect, spaces.widths) == (effect, widths)
 
 
@@ -100,41 +100,41 @@ def test_pose_frame_is_the_config_frame_and_reading_uses_the_base_frame() -> Non
 # Checks of the state to plan from
 
 
-def changed(place: int, value: float) -> np.ndarray:
+def changed(column: int, value: float) -> np.ndarray:
     state = STATES[0].copy()
-    state[place] = value
+    state[column] = value
     return state
 
 
-@pytest.mark.parametrize("place", range(7))
+@pytest.mark.parametrize("column", range(7))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_invalid_number_raises_at_any_index(place: int, sign: int) -> None:
-    complaint = ["millimetres", "degrees", "0 for open"][place // 3]
-    wrong = {0: 300.0, 1: 90.0, 2: 1.2 if sign > 0 else 0.2}[place // 3]
-    with pytest.raises(InputError, match=complaint):
-        POSE.require_state(changed(place, sign * wrong), "state")
+def test_invalid_number_raises_at_any_index(column: int, sign: int) -> None:
+    message = ["millimetres", "degrees", "0 for open"][column // 3]
+    wrong = {0: 300.0, 1: 90.0, 2: 1.2 if sign > 0 else 0.2}[column // 3]
+    with pytest.raises(InputError, match=message):
+        POSE.require_state(changed(column, sign * wrong), "state")
     for never in (math.nan, sign * math.inf):
         with pytest.raises(InputError, match=rf"{never}\b.* Expected finite numbers") as caught:
-            POSE.require_state(changed(place, never), "state")
+            POSE.require_state(changed(column, never), "state")
         assert "degrees" not in str(caught.value)
-    if place < 6:
-        with pytest.raises(InputError, match=complaint):
-            EXTRINSICS.require_state(changed(place, sign * wrong)[:6], "camera")
+    if column < 6:
+        with pytest.raises(InputError, match=message):
+            EXTRINSICS.require_state(changed(column, sign * wrong)[:6], "camera")
 
 
 def test_plausible_states_are_accepted() -> None:
-    for place, value in ((6, 1.05), (6, -0.05), (6, 1.0), (5, -2 * math.pi), (3, math.pi), (0, 1.2), (2, -0.4)):
-        POSE.require_state(changed(place, value), "state")
-        EXTRINSICS.require_state(changed(place, value)[:6], "camera")
+    for column, value in ((6, 1.05), (6, -0.05), (6, 1.0), (5, -2 * math.pi), (3, math.pi), (0, 1.2), (2, -0.4)):
+        POSE.require_state(changed(column, value), "state")
+        EXTRINSICS.require_state(changed(column, value)[:6], "camera")
 
 
 def test_require_state_checks_width_and_finiteness() -> None:
     make_vector_states(2).require_state(np.array([300.0, -90.0]), "state")
-    for numbers, space, complaint in (
+    for numbers, space, message in (
         (np.zeros(5), EXTRINSICS, "5 numbers"),
         (np.zeros(7), EXTRINSICS, "7 numbers"),
         (np.zeros(3), make_vector_states(2), r"3 numbers .* Expected 2: state 0, state 1"),
         (np.array([0.0, math.nan]), make_vector_states(2), "Expected finite numbers"),
     ):
-        with pytest.raises(InputError, match=complaint):
+        with pytest.raises(InputError, match=message):
             space.require_state(numbers, "state")

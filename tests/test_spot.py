@@ -71,12 +71,15 @@ def test_kubernetes_schema_accepts_the_file_and_rejects_a_misspelt_key(tmp_path:
     words = ["--no-deps", "--target", str(tmp_path), "kubernetes-validate==1.37.0", "importlib_resources==7.1.0"]
     install(sys.executable, *words)
     (tmp_path / "wrong.yaml").write_text(KUBERNETES.read_text().replace("backoffLimit", "backofLimit"))
-    for file, said in ((KUBERNETES, "passed for resource job"), (tmp_path / "wrong.yaml", "'backofLimit' was unexp")):
+    for file, message in (
+        (KUBERNETES, "passed for resource job"),
+        (tmp_path / "wrong.yaml", "'backofLimit' was unexp"),
+    ):
         command = [sys.executable, "-m", "kubernetes_validate", "--strict", str(file)]
         environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-        assert (done.returncode == 0) == (file == KUBERNETES), done.stderr
-        assert said in done.stdout + done.stderr
+        process = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert (process.returncode == 0) == (file == KUBERNETES), process.stderr
+        assert message in process.stdout + process.stderr
 
 
 # ---- preemption ----
@@ -108,9 +111,9 @@ class Pods:
         """Wait, and restart failed pods, as the job's controller does."""
         until = time.monotonic() + 200
         while not happened():
-            assert time.monotonic() < until, [one.written() for one in self.running]
-            for index, one in enumerate(self.running):
-                if one.poll():
+            assert time.monotonic() < until, [pod.written() for pod in self.running]
+            for index, pod in enumerate(self.running):
+                if pod.poll():
                     self.running[index] = self._start(index)
             time.sleep(0.05)
 
@@ -121,8 +124,8 @@ class Pods:
 
 def newest(folder: Path, machines: str) -> Path:
     """Return the newest checkpoint on any of these machines."""
-    found = [newest_checkpoint(run / "checkpoints") for run in folder.glob(f"{machines}/run")]
-    return max(filter(None, found), key=lambda checkpoint: checkpoint.name)
+    checkpoints = [newest_checkpoint(run / "checkpoints") for run in folder.glob(f"{machines}/run")]
+    return max(filter(None, checkpoints), key=lambda checkpoint: checkpoint.name)
 
 
 @pytest.mark.usefixtures("default_signals")
@@ -138,13 +141,13 @@ def test_run_with_a_preempted_pod_equals_an_uninterrupted_run(
     try:
         pods.wait_until(lambda: pods.steps_done() >= 2)
         os.kill(pods.running[0].pid, signal.SIGTERM)  # as Kubernetes does, to the first process alone
-        pods.wait_until(lambda: all(one.poll() == 0 for one in pods.running))
+        pods.wait_until(lambda: all(pod.poll() == 0 for pod in pods.running))
     finally:
-        for one in pods.running:
-            one.kill()
+        for pod in pods.running:
+            pod.kill()
     assert pods.started > 2
-    stopped, done = newest(tmp_path, "machine-[12]"), newest(tmp_path, "machine-*").parent
+    stopped, resumed_run = newest(tmp_path, "machine-[12]"), newest(tmp_path, "machine-*").parent
     assert 2 <= read_state(stopped).step < STEPS
-    assert done != stopped.parent
-    assert (done / stopped.name).is_dir(), "a new machine resumed from the checkpoint of the stopped ones"
-    assert_equal_up_to_rounding(whole, done.parent)
+    assert resumed_run != stopped.parent
+    assert (resumed_run / stopped.name).is_dir(), "a new machine resumed from the checkpoint of the stopped ones"
+    assert_equal_up_to_rounding(whole, resumed_run.parent)

@@ -38,10 +38,12 @@ def commands(parser: argparse.ArgumentParser, name: str) -> Iterator[str]:
     words = [action.metavar or action.dest for action in parser._actions if not action.option_strings]
     options = sorted(action.option_strings[-1] for action in parser._actions if action.option_strings)
     if not inner:
-        yield " ".join([name, *(str(word) for word in words), *(one for one in options if one != "--help")])
+        yield " ".join(
+            [name, *(str(word) for word in words), *(subparser for subparser in options if subparser != "--help")]
+        )
     for action in inner:
-        for command, one in action.choices.items():
-            yield from commands(one, f"{name} {command}")
+        for command, subparser in action.choices.items():
+            yield from commands(subparser, f"{name} {command}")
 
 
 def leaf_keys() -> set[str]:
@@ -50,10 +52,10 @@ def leaf_keys() -> set[str]:
     return {key for key in keys if not any(other.startswith(f"{key}.") for other in keys)}
 
 
-def printed(what: str) -> str:
+def printed(subject: str) -> str:
     """Return what this file prints in a process of its own: other tests register sources and energies in this one."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    words = [sys.executable, "-W", "ignore", __file__, what]
+    words = [sys.executable, "-W", "ignore", __file__, subject]
     return subprocess.run(words, env=environment, capture_output=True, text=True, check=True).stdout
 
 

@@ -47,18 +47,18 @@ def config(make_config, tmp_path: Path) -> str:
 def trials(main: Callable[..., None], folder: Path) -> list[Any]:
     optuna, names = main.__globals__["optuna"], main.__globals__
     storage = names["JournalStorage"](names["JournalFileBackend"](str(folder / "study.journal")))
-    found: list[Any] = optuna.load_study(study_name=None, storage=storage).trials
-    return found
+    study_trials: list[Any] = optuna.load_study(study_name=None, storage=storage).trials
+    return study_trials
 
 
 def test_stopped_sweep_resumes_with_the_open_trial(
     sweep: Callable[..., None], config: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
-    folder, step_of_the_loop, seen = tmp_path / "sweep", loop.training_step, []
+    folder, step_of_the_loop, step_folders = tmp_path / "sweep", loop.training_step, []
 
     def stopping(run: Any, *args: Any, **kwargs: Any) -> Any:
-        seen.append(run.folder.name)
-        if seen == ["000"] * 4 + ["001"] * 2:
+        step_folders.append(run.folder.name)
+        if step_folders == ["000"] * 4 + ["001"] * 2:
             os.kill(os.getpid(), signal.SIGUSR1)
         return step_of_the_loop(run, *args, **kwargs)
 
@@ -67,16 +67,16 @@ def test_stopped_sweep_resumes_with_the_open_trial(
         sweep(str(folder), "3", config)
     assert read_state(newest_checkpoint(folder / "001/checkpoints")).step == 2
     sweep(str(folder), "3", config)
-    assert seen == ["000"] * 4 + ["001"] * 4 + ["002"] * 4, "no step is done twice"
-    done = trials(sweep, folder)
-    assert [trial.state.name for trial in done] == ["COMPLETE"] * 3
-    assert len({str(trial.params) for trial in done}) == 3
-    runs = [folder / f"{trial.number:03}" for trial in done]
-    for run, trial in zip(runs, done, strict=True):
+    assert step_folders == ["000"] * 4 + ["001"] * 4 + ["002"] * 4, "no step is done twice"
+    completed = trials(sweep, folder)
+    assert [trial.state.name for trial in completed] == ["COMPLETE"] * 3
+    assert len({str(trial.params) for trial in completed}) == 3
+    runs = [folder / f"{trial.number:03}" for trial in completed]
+    for run, trial in zip(runs, completed, strict=True):
         selected = parse_step(select_checkpoint(run).path.name)
         rows = [row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] == "validation"]
         assert trial.value == next(row["action_ranking_error"] for row in rows if row["step"] == selected)
-    assert f"in {min(zip(done, runs, strict=True), key=lambda one: one[0].value)[1]}" in capsys.readouterr().out
+    assert f"in {min(zip(completed, runs, strict=True), key=lambda pair: pair[0].value)[1]}" in capsys.readouterr().out
 
 
 def test_sweep_continues_after_a_trial_with_an_invalid_config(

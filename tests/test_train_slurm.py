@@ -35,9 +35,9 @@ def submit(folder: Path, run_ends_with: int, **more: str) -> tuple[int, list[str
         (folder / name).chmod(0o755)
     job = {"SLURM_JOB_ID": "123456", "SLURM_NTASKS": "2", "SLURM_JOB_NODELIST": "node[7-8]"}
     environment = {"PATH": f"{folder}:{os.environ['PATH']}", "RUN_ENDS_WITH": str(run_ends_with), **job, **more}
-    done = subprocess.run(["bash", str(SCRIPT), "my.yaml", "seed=1"], env=environment, cwd=folder, check=False)
+    process = subprocess.run(["bash", str(SCRIPT), "my.yaml", "seed=1"], env=environment, cwd=folder, check=False)
     calls = folder / "calls"
-    return done.returncode, calls.read_text().splitlines() if calls.exists() else []
+    return process.returncode, calls.read_text().splitlines() if calls.exists() else []
 
 
 def test_every_process_receives_its_rank_and_address(tmp_path: Path) -> None:
@@ -50,11 +50,11 @@ def test_every_process_receives_its_rank_and_address(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(("ends_with", "status", "again"), [(75, 0, True), (2, 2, False), (137, 137, False)])
-def test_only_a_resumable_run_is_queued_again(tmp_path, ends_with: int, status: int, again: bool) -> None:
-    found, calls = submit(tmp_path, ends_with)
-    assert found == status
-    assert (calls[-1] == "scontrol requeue 123456") == again
+@pytest.mark.parametrize(("ends_with", "status", "is_requeued"), [(75, 0, True), (2, 2, False), (137, 137, False)])
+def test_only_a_resumable_run_is_queued_again(tmp_path, ends_with: int, status: int, is_requeued: bool) -> None:
+    returncode, calls = submit(tmp_path, ends_with)
+    assert returncode == status
+    assert (calls[-1] == "scontrol requeue 123456") == is_requeued
 
 
 def test_array_task_uses_its_grid_line_and_its_own_folder(tmp_path: Path) -> None:
@@ -72,13 +72,13 @@ def test_array_task_uses_its_grid_line_and_its_own_folder(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("more", "said"), [({}, "names the file of overrides"), ({"GRID": "sweep.txt"}, "sweep.txt has no line 2")]
+    ("more", "message"), [({}, "names the file of overrides"), ({"GRID": "sweep.txt"}, "sweep.txt has no line 2")]
 )
 def test_array_without_grid_or_line_starts_no_training(
-    tmp_path: Path, more: dict[str, str], said: str, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, more: dict[str, str], message: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "sweep.txt").write_text("seed=1\n")
     status, calls = submit(tmp_path, run_ends_with=0, SLURM_ARRAY_TASK_ID="2", **more)
     assert status
     assert calls == []
-    assert said in capfd.readouterr().err
+    assert message in capfd.readouterr().err

@@ -46,9 +46,11 @@ def run(*words: object, at: Path, path: Path | None = None) -> str:
         "PYTHONSAFEPATH": "1",
         "PIP_DISABLE_PIP_VERSION_CHECK": "1",
     }
-    done = subprocess.run(list(map(str, words)), cwd=at, env=environment, text=True, capture_output=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    process = subprocess.run(
+        list(map(str, words)), cwd=at, env=environment, text=True, capture_output=True, check=False
+    )
+    assert process.returncode == 0, process.stdout + process.stderr
+    return process.stdout
 
 
 def test_wheel_has_exactly_the_files_of_the_package(wheel: Path) -> None:
@@ -81,10 +83,10 @@ def test_installed_wheel_works_outside_of_the_checkout(installed: Path, tmp_path
         "train own.yaml --check training.allow_weak_base=true",
     )  # fmt: skip
     words = json.dumps([command.split() for command in commands])
-    where, said, listed, converter, _ = json.loads(
+    package_path, init_output, config_list, converter, _ = json.loads(
         run(sys.executable, "-c", COMMANDS, words, at=tmp_path, path=installed)
     )
-    assert Path(where).is_relative_to(installed)
-    assert "vjepa2-ac train own.yaml --check" in said
-    assert "builtin:demo" in listed
+    assert Path(package_path).is_relative_to(installed)
+    assert "vjepa2-ac train own.yaml --check" in init_output
+    assert "builtin:demo" in config_list
     assert converter == (ROOT / "examples/convert/ros2_bag.py").read_text()

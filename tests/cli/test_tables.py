@@ -21,7 +21,7 @@ from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions, ClosedLoopBenchmark
 from vjepa2_ac.simulation.rollout import ClosedLoopResult
 from vjepa2_ac.spaces import POSE, make_vector_states
-from worlds import Copier, Halfway, about, again, clips_batch
+from worlds import Copier, Halfway, about, clips_batch, repeatable_clips
 
 SURE = Estimate(-0.123, -0.145, -0.101)
 SHARE = Estimate(0.912, 0.888, 0.934)
@@ -42,7 +42,7 @@ def evaluations() -> list[Table]:
     ]
     evaluated_models += [EvaluatedModel(name, "other", Copier()) for name in names[2:]]
     probes = ProbeOptions(ranking_clips=4, samples=4, landscape_clips=2, nodes=3, examples=0)
-    evaluation = evaluate(cast("Any", evaluated_models), again(clips_batch(12, 0)), about(), probes=probes)
+    evaluation = evaluate(cast("Any", evaluated_models), repeatable_clips(clips_batch(12, 0)), about(), probes=probes)
     return row_tables(make_rows(evaluation), "Held-out episodes")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clips import open_in_memory
+from clips import open_memory_source
 from memory_source import MemorySource
 from vjepa2_ac.config.sources import NpzData
 from vjepa2_ac.data.dataset import Dataset, open_dataset
@@ -34,20 +34,20 @@ def test_broken_episode_limit_is_three_or_one_percent_and_half_of_small_sets(epi
 
 def broken_in_the_index(episodes: int, broken: int, _folder: Path) -> Use:
     problems = [EpisodeProblem(f"bad {number}", f"record {number}", "all zeros") for number in range(broken)]
-    return lambda **values: open_in_memory(MemorySource([20] * (episodes - broken), problems=problems), **values)
+    return lambda **values: open_memory_source(MemorySource([20] * (episodes - broken), problems=problems), **values)
 
 
 def broken_in_idle_filter(episodes: int, broken: int, folder: Path) -> Use:
     options = {"idle": {"rule": "motion"}, "disk_cache": {"dir": str(folder)}}
     source = MemorySource([60] * episodes, unreadable=frozenset(range(episodes - broken, episodes)))
-    return lambda **values: open_in_memory(source, **options, **values)
+    return lambda **values: open_memory_source(source, **options, **values)
 
 
 def broken_in_a_clip(episodes: int, broken: int, _folder: Path) -> Use:
     source = MemorySource([6] * episodes, pictureless=frozenset(range(broken)))
 
     def use(**values: Any) -> Dataset:
-        dataset = open_in_memory(source, **values)
+        dataset = open_memory_source(source, **values)
         windows = dataset.windows("train")
         list(read_batches(dataset, [windows[index] for index in range(len(windows))], batch_size=2))
         return dataset
@@ -57,7 +57,7 @@ def broken_in_a_clip(episodes: int, broken: int, _folder: Path) -> Use:
 
 def duplicate_identities(episodes: int, broken: int, _folder: Path) -> Use:
     names = ["same"] * (broken + 1) + [f"episode {number}" for number in range(episodes - broken - 1)]
-    return lambda **values: open_in_memory(MemorySource([20] * episodes, names=names), **values)
+    return lambda **values: open_memory_source(MemorySource([20] * episodes, names=names), **values)
 
 
 def broken_files(episodes: int, broken: int, folder: Path) -> Use:

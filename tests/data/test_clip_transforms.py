@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from clip_transforms import TRANSFORMS as EXAMPLES
-from clips import open_in_memory
+from clips import open_memory_source
 from memory_source import MemorySource
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
@@ -30,7 +30,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 def open_set(*transforms: dict[str, Any], **keys: Any) -> Dataset:
-    return open_in_memory(MemorySource([30] * 10), transforms=transforms, **keys)
+    return open_memory_source(MemorySource([30] * 10), transforms=transforms, **keys)
 
 
 def frames(dataset: Dataset, count: int, seed: int = 1, **keys: Any) -> torch.Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as TorchDataset
 
-from clips import clip_at, open_in_memory
+from clips import clip_at, open_memory_source
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips import collate
@@ -45,7 +45,7 @@ def test_clips_are_sorted_by_identity_and_start(droid: Path) -> None:
 
 
 def test_negative_indices_and_iteration_follow_the_sequence_protocol() -> None:
-    clips = open_in_memory(MemorySource([9, 9])).clips()
+    clips = open_memory_source(MemorySource([9, 9])).clips()
     assert len(list(clips)) == len(clips) == 10
     assert windows_of([clips[-1], clips[-10]]) == windows_of([clips[9], clips[0]])
     assert windows_of([clips[np.int64(3)], clips[torch.tensor(3)]]) == windows_of([clips[3]] * 2)
@@ -57,7 +57,7 @@ def test_negative_indices_and_iteration_follow_the_sequence_protocol() -> None:
 
 
 def test_default_collate_returns_a_batch() -> None:
-    clips = open_in_memory(MemorySource([9, 9])).clips()
+    clips = open_memory_source(MemorySource([9, 9])).clips()
     batches = list(DataLoader(clips, batch_size=4))
     assert [type(batch) for batch in batches] == [Batch] * 3
     assert [tuple(batch.frames.shape) for batch in batches] == [(4, 3, 4, 5, 3)] * 2 + [(2, 3, 4, 5, 3)]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from lerobot_sets import Recorded, numbered, numbers_of, write_v30
+from lerobot_sets import Recorded, draw_numbers, numbers_of, write_v30
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
@@ -75,7 +75,7 @@ def test_converted_poses_equal_the_originals(droid: Path, tmp_path: Path) -> Non
 def test_converted_video_has_one_frame_per_step(tmp_path: Path) -> None:
     def recording(number: int, steps: int) -> Recorded:
         states = synthetic_states(steps, seed=number).astype(np.float32)
-        drawn = [numbered(draw_frame(state, size=(48, 64)), number, step) for step, state in enumerate(states)]
+        drawn = [draw_numbers(draw_frame(state, size=(48, 64)), number, step) for step, state in enumerate(states)]
         return Recorded({"observation.state": states}, {"observation.images.front": drawn})
 
     source = write_v30(tmp_path / "in", [recording(number, 70) for number in range(3)])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clips import open_in_memory
+from clips import open_memory_source
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset as dataset_module
@@ -32,7 +32,7 @@ def problems(count: int) -> list[EpisodeProblem]:
 
 def test_each_filter_reports_the_episodes_it_removed() -> None:
     source = MemorySource([10, 20, 30, 40, 50], [True, False, None, True, False], problems=problems(2))
-    dataset = open_in_memory(source, exclude=("episode 4", "bad 1", "bad 0"), outcome="success")
+    dataset = open_memory_source(source, exclude=("episode 4", "bad 1", "bad 0"), outcome="success")
     assert removed(dataset) == {
         "excluded": (3, 50, 46),
         "outcome": (2, 50, 16 + 26),
@@ -40,14 +40,14 @@ def test_each_filter_reports_the_episodes_it_removed() -> None:
         "idle": (0, 0, 0),
     }
     assert dataset.windows("train").episodes.tolist() == [0, 3]
-    assert len(open_in_memory(source, exclude=("bad 1", "bad 0"), outcome="failure").windows("train")) == 16 + 46
+    assert len(open_memory_source(source, exclude=("bad 1", "bad 0"), outcome="failure").windows("train")) == 16 + 46
 
 
 def test_outcome_filter_without_success_labels_raises() -> None:
     with pytest.raises(InputError, match=r"data\.outcome: success: no episode.*Set data\.outcome: all"):
-        open_in_memory(MemorySource([10, 10]), outcome="success")
+        open_memory_source(MemorySource([10, 10]), outcome="success")
     with pytest.raises(InputError, match=r"none of 2 episodes remains \(removed: outcome 2\)"):
-        open_in_memory(MemorySource([10, 10], [False, None]), outcome="success")
+        open_memory_source(MemorySource([10, 10], [False, None]), outcome="success")
 
 
 def test_broken_episodes_count_across_resume_unless_excluded() -> None:
@@ -64,7 +64,7 @@ def test_broken_episodes_count_across_resume_unless_excluded() -> None:
 
 def test_excluding_an_unknown_episode_raises() -> None:
     with pytest.raises(InputError, match=r"data\.exclude: unknown episodes: elsewhere\."):
-        open_in_memory(MemorySource([10], problems=problems(1)), exclude=("elsewhere", "bad 0"))
+        open_memory_source(MemorySource([10], problems=problems(1)), exclude=("elsewhere", "bad 0"))
 
 
 def droid_sized() -> EpisodeTable:
@@ -115,7 +115,7 @@ def test_opening_a_data_set_of_droid_size_makes_no_call_per_episode_and_needs_50
 
     tracemalloc.start()
     sys.setprofile(count)
-    windows = open_in_memory(StoredSource(), outcome="success", stride=4, frames=16, idle=idle).windows("train")
+    windows = open_memory_source(StoredSource(), outcome="success", stride=4, frames=16, idle=idle).windows("train")
     sys.setprofile(None)
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()

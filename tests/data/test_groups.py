@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clips import open_in_memory, split_of
+from clips import open_memory_source, split_of
 from copied_sets import write_lerobot, write_npz, write_raw, write_rlds
 from latent_sets import write_cache
 from memory_source import MemorySource
@@ -31,7 +31,7 @@ def config_of(**changes: Any) -> DataConfig:
 
 def open_set(names: list[str] | None = None, **changes: Any) -> Dataset:
     names = NAMES if names is None else names
-    return open_in_memory(MemorySource([20] * len(names), names=names), **(SHARES | changes))
+    return open_memory_source(MemorySource([20] * len(names), names=names), **(SHARES | changes))
 
 
 def splits_of(dataset: Dataset) -> dict[str, str]:

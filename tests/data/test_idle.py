@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clips import open_in_memory
+from clips import open_memory_source
 from gcs import Gcs
 from memory_source import MemorySource
 from paths import GOLDEN
@@ -87,7 +87,7 @@ def test_selected_ranges_are_disjoint_and_contain_no_long_idle_run(idle: list[bo
 
 @pytest.fixture
 def open_with(tmp_path: Path) -> Any:
-    return partial(open_in_memory, path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")})
+    return partial(open_memory_source, path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")})
 
 
 def source_with_rests(lengths: list[int] | None = None, **options: Any) -> MemorySource:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from clips import clip_at, open_in_memory
+from clips import clip_at, open_memory_source
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
@@ -156,7 +156,7 @@ def take_batches(dataset: Dataset, count: int, **options: Any) -> list[Batch]:
 @pytest.mark.parametrize("world_size", [1, 3])
 @pytest.mark.parametrize("batch_size", [1, 4])
 def test_ranks_read_each_window_exactly_once_per_epoch(world_size: int, batch_size: int) -> None:
-    dataset = open_in_memory(MemorySource([9, 12, 7, 10]))
+    dataset = open_memory_source(MemorySource([9, 12, 7, 10]))
     all_windows = {(f"episode {e}", s) for e, length in enumerate((9, 12, 7, 10)) for s in range(length - 4)}
     steps = -(-2 * len(all_windows) // (world_size * batch_size))
     batches_by_rank = [
@@ -172,9 +172,9 @@ def test_ranks_read_each_window_exactly_once_per_epoch(world_size: int, batch_si
 
 def test_resume_reads_no_earlier_clips() -> None:
     lengths = [30] * 40
-    all_names = names(take_batches(open_in_memory(MemorySource(lengths)), 60))
+    all_names = names(take_batches(open_memory_source(MemorySource(lengths)), 60))
     source = MemorySource(lengths)
-    resumed = take_batches(open_in_memory(source), 2, start_position=100)
+    resumed = take_batches(open_memory_source(source), 2, start_position=100)
     assert names(resumed) == all_names[100:104]
     assert len(source.reads) == 4
     assert len(source.decoded) == 4 * 3
@@ -186,7 +186,7 @@ CAMERAS = ("exterior_1_left", "exterior_2_left", "wrist_left")
 def test_camera_of_a_clip_depends_on_seed_and_position_only() -> None:
     def cameras(start: int, count: int) -> list[str | None]:
         source = MemorySource([30] * 10)
-        take_batches(open_in_memory(source, camera=CAMERAS[:2]), count, batch_size=1, start_position=start)
+        take_batches(open_memory_source(source, camera=CAMERAS[:2]), count, batch_size=1, start_position=start)
         return [camera for _, camera, _ in source.reads]
 
     drawn = cameras(0, 200)
@@ -201,8 +201,8 @@ def test_camera_of_a_clip_depends_on_seed_and_position_only() -> None:
 def test_camera_frame_poses_give_camera_frame_actions() -> None:
     cameras = np.tile([0.3, -0.2, 0.5, 0.4, -0.3, 1.2], (30, 1))
     source = MemorySource([30], extrinsics=lambda _: cameras)
-    in_base = clip_at(open_in_memory(source), 0, 3)
-    dataset = open_in_memory(source)
+    in_base = clip_at(open_memory_source(source), 0, 3)
+    dataset = open_memory_source(source)
     dataset = replace(dataset, config=dataset.config.model_copy(update={"pose_frame": "camera"}))
     clip = clip_at(dataset, 0, 3)
     expected = states_in_camera_frame(source.read(0).states[3:8:2], cameras[3:8:2])
@@ -217,7 +217,7 @@ def test_camera_frame_poses_give_camera_frame_actions() -> None:
 
 def broken_set(broken: set[int], **options: Any) -> Dataset:
     source = MemorySource([5] * 300, pictureless=frozenset(broken))
-    return open_in_memory(source, **({"broken_episodes": "skip"} | options))
+    return open_memory_source(source, **({"broken_episodes": "skip"} | options))
 
 
 def test_unreadable_clip_is_dropped_without_replacement(caplog: pytest.LogCaptureFixture) -> None:
@@ -280,7 +280,7 @@ def test_remote_clips_are_read_concurrently() -> None:
             barrier.wait()  # no thread continues before four have arrived
             return super().read(*arguments)
 
-    dataset = open_in_memory(Slow([30] * 10))
-    expected = names(take_batches(open_in_memory(MemorySource([30] * 10)), 3, batch_size=4))
+    dataset = open_memory_source(Slow([30] * 10))
+    expected = names(take_batches(open_memory_source(MemorySource([30] * 10)), 3, batch_size=4))
     remote = replace(dataset, config=dataset.config.model_copy(update={"path": "gs://bucket/set"}))
     assert names(take_batches(remote, 3, batch_size=4)) == expected

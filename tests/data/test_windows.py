@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clips import open_in_memory
+from clips import open_memory_source
 from memory_source import MemorySource
 from paths import GOLDEN, ROOT
 from vjepa2_ac.config.data import DataConfig, Split
@@ -144,7 +144,7 @@ def test_larger_held_out_share_only_moves_episodes_out_of_train() -> None:
 
 def splits_of(source: MemorySource, **options: object) -> dict[str, Split]:
     """Return the split of each used episode."""
-    dataset = open_in_memory(source, **({"validation_share": 0.02, "test_share": 0.02} | options))
+    dataset = open_memory_source(source, **({"validation_share": 0.02, "test_share": 0.02} | options))
     return {
         dataset.table.identity(int(index)): split
         for split in SPLITS

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from clips import open_in_memory
+from clips import open_memory_source
 from failing_rows import Rows
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
@@ -71,7 +71,7 @@ def test_full_shared_memory_raises_from_the_worker(monkeypatch: pytest.MonkeyPat
         raise RuntimeError("unable to allocate shared memory(shm)")
 
     monkeypatch.setattr(loader, "get_worker_info", lambda: True)
-    dataset = open_in_memory(MemorySource([30] * 4))
+    dataset = open_memory_source(MemorySource([30] * 4))
     with contextlib.closing(loader.training_loader(dataset, seed=0, batch_size=2)) as batches:
         assert next(batches).frames.is_shared()
         monkeypatch.setattr(torch.Tensor, "share_memory_", full)

@@ -40,7 +40,7 @@ from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, make_vector_actions
-from worlds import DIM, TIME, Copier, Halfway, Oracle, about, again, clips_batch, in_batches, rows
+from worlds import DIM, TIME, Copier, Halfway, Oracle, about, clips_batch, in_batches, repeatable_clips, rows
 
 PROBES = ProbeOptions(ranking_clips=6, samples=20, landscape_clips=3, nodes=5, examples=3, at_once=7)
 
@@ -49,7 +49,7 @@ def evaluated(trained: object, base: object | None = None, *, size: int = 4, **c
     evaluated_models = [] if base is None else [EvaluatedModel("base", "base", base)]  # type: ignore[arg-type]
     evaluated_models.append(EvaluatedModel("adapter", "trained", trained))  # type: ignore[arg-type]
     batch = clips_batch(actions=changes.pop("actions", None))  # type: ignore[arg-type]
-    return evaluate(evaluated_models, again(batch, size), about(**changes), probes=PROBES)
+    return evaluate(evaluated_models, repeatable_clips(batch, size), about(**changes), probes=PROBES)
 
 
 def adapter_and_base_errors(evaluation: Evaluation) -> tuple[PredictionErrors, PredictionErrors]:
@@ -154,7 +154,7 @@ def test_vector_actions_have_no_unit_and_vectors_of_two_numbers_no_landscape() -
     vectors, narrow = (
         evaluate(
             evaluated_models,
-            again(clips_batch(width=width), space=make_vector_actions(width, "change")),
+            repeatable_clips(clips_batch(width=width), space=make_vector_actions(width, "change")),
             about(),
             probes=PROBES,
         )
@@ -191,7 +191,7 @@ def test_each_model_predicts_within_its_prediction_context() -> None:
         EvaluatedModel("base", "base", InContext(), base_context),
         EvaluatedModel("adapter", "trained", OutsideContext()),
     ]
-    evaluate(evaluated_models, again(clips_batch()), about(), probes=PROBES)
+    evaluate(evaluated_models, repeatable_clips(clips_batch()), about(), probes=PROBES)
 
 
 # ---- which steps move ----
@@ -257,7 +257,9 @@ def test_a_validation_has_the_errors_of_an_evaluation_of_the_same_clips() -> Non
     errors = prediction_errors(Halfway(), in_batches(clips_batch(), 4))
     assert errors.arrays.keys() == {(actions, mode, "l1") for actions, mode in VALIDATION_PREDICTIONS}
     probes = ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0)
-    evaluation = evaluate([EvaluatedModel("model", "trained", Halfway())], again(clips_batch()), about(), probes=probes)
+    evaluation = evaluate(
+        [EvaluatedModel("model", "trained", Halfway())], repeatable_clips(clips_batch()), about(), probes=probes
+    )
     evaluated_errors = evaluation.models["model"].errors
     assert evaluated_errors.episode_ids == errors.episode_ids
     for kind, values in errors.arrays.items():

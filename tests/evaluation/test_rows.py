@@ -15,7 +15,7 @@ from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
-from worlds import Copier, Halfway, Oracle, about, again, clips_batch
+from worlds import Copier, Halfway, Oracle, about, clips_batch, repeatable_clips
 
 EVALUATION = evaluation(others=("runs/other",))
 
@@ -75,7 +75,7 @@ PROBES = ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0)
 
 def evaluated(trained: object, base: object, *more: Metric) -> Evaluation:
     evaluated_models = [EvaluatedModel("base", "base", base), EvaluatedModel("adapter", "trained", trained)]  # type: ignore[arg-type]
-    return evaluate(evaluated_models, again(clips_batch()), about(), metrics=(L1, L2, *more), probes=PROBES)
+    return evaluate(evaluated_models, repeatable_clips(clips_batch()), about(), metrics=(L1, L2, *more), probes=PROBES)
 
 
 def test_a_third_party_metric_appears_in_rows_and_comparison(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from vjepa2_ac.evaluation.summary import Conclusion
 from vjepa2_ac.reports.comparison import Comparison, compare
 from vjepa2_ac.reports.evaluation_figures import plot_comparison
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_csv, write_metrics
-from worlds import Copier, Halfway, Oracle, about, again, clips_batch
+from worlds import Copier, Halfway, Oracle, about, clips_batch, repeatable_clips
 
 PROBES = ProbeOptions(ranking_clips=4, samples=10, landscape_clips=2, nodes=3, examples=0)
 
@@ -34,7 +34,7 @@ def written(
     folder.mkdir()
     evaluated_models = [EvaluatedModel("base", "base", base), EvaluatedModel("adapter", "trained", model)]  # type: ignore[arg-type]
     comparison = evaluate(
-        evaluated_models, again(clips_batch(clips, seed)), about(seed=ranking_seed, **changes), probes=probes
+        evaluated_models, repeatable_clips(clips_batch(clips, seed)), about(seed=ranking_seed, **changes), probes=probes
     )
     write_metrics(comparison, folder / METRICS_FILE)
     return folder

@@ -15,7 +15,7 @@ import pytest
 from vjepa2_ac.evaluation.evaluate import EvaluatedModel, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
-from worlds import Oracle, about, again, clips_batch
+from worlds import Oracle, about, clips_batch, repeatable_clips
 
 T = {5: 2.7764451, 6: 2.5705818}  # by number of episodes n: the quantile 0.975 of Student's t with n - 1 degrees
 PROBES = ProbeOptions(ranking_clips=10, samples=12, landscape_clips=10, nodes=3, examples=0)
@@ -41,7 +41,7 @@ def measured(folder: Path, *, with_base: bool) -> dict[str, Any]:
         EvaluatedModel("adapter", "trained", TooShort())
     ]
     path = write_metrics(
-        evaluate(evaluated_models, again(clips_batch()), about(), probes=PROBES), folder / METRICS_FILE
+        evaluate(evaluated_models, repeatable_clips(clips_batch()), about(), probes=PROBES), folder / METRICS_FILE
     )
     content: dict[str, Any] = json.loads(path.read_text())
     return content

@@ -200,7 +200,7 @@ def test_failed_write_keeps_older_checkpoints_and_leaves_no_partial_one(tmp_path
     write(tmp_path / "count", 10)
     faults.set()
     write(tmp_path / "count", 20)
-    operations = faults.done
+    operations = faults.num_operations
     assert operations > 10, "the write creates folders and files, flushes them, and renames the folder"
     for number in range(1, operations + 1):
         folder = tmp_path / str(number)

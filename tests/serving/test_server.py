@@ -16,7 +16,7 @@ import websockets.sync.client
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from ranks import wait_until
-from served import STATE, Running, image, make_controller, request, serving, session
+from served import STATE, ServerAddress, image, make_controller, request, serving, session
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.serving import access
 from vjepa2_ac.serving.access import Access
@@ -28,8 +28,8 @@ from vjepa2_ac.serving.wire import pack, unpack
 KEY = "correct-horse-battery-staple"
 
 
-def get(running: Running, path: str, **headers: str) -> tuple[int, str]:
-    host, port = running.http.removeprefix("http://").split(":")
+def get(server: ServerAddress, path: str, **headers: str) -> tuple[int, str]:
+    host, port = server.http.removeprefix("http://").split(":")
     connection = http.client.HTTPConnection(host, int(port), timeout=120)
     try:
         connection.request("GET", path, headers=headers)
@@ -40,9 +40,9 @@ def get(running: Running, path: str, **headers: str) -> tuple[int, str]:
 
 
 @contextlib.contextmanager
-def connect(running: Running, **options: object) -> Iterator[websockets.sync.client.ClientConnection]:
+def connect(server: ServerAddress, **options: object) -> Iterator[websockets.sync.client.ClientConnection]:
     with websockets.sync.client.connect(
-        running.url, compression=None, max_size=None, proxy=None, **options
+        server.url, compression=None, max_size=None, proxy=None, **options
     ) as connection:
         yield connection
 
@@ -74,7 +74,7 @@ class SlowSession:
 def test_actions_received_over_the_socket_equal_those_of_the_controller() -> None:
     controller = make_controller()
     controller.reset(image(100))
-    with serving(session) as running, PlanningClient(running.url) as client:
+    with serving(session) as server, PlanningClient(server.url) as client:
         for step in range(3):
             reply = client.infer(request(step, goal_image=image(100)))
             np.testing.assert_array_equal(reply["actions"][0], controller.act(image(step), STATE))
@@ -129,17 +129,17 @@ def test_server_stopped_while_loading_does_not_listen() -> None:
 
 
 def test_second_robot_is_rejected_until_the_first_disconnects() -> None:
-    with serving(session) as running:
-        first = PlanningClient(running.url)
+    with serving(session) as server:
+        first = PlanningClient(server.url)
         port = first._connection.local_address[1]
         with pytest.raises(UnreachableError, match=f"HTTP 503: busy: the robot at 127.0.0.1:{port} is connected"):
-            PlanningClient(running.url)
-        assert get(running, "/healzth")[0] == 404
-        assert get(running, "/healthz")[0] == 200
+            PlanningClient(server.url)
+        assert get(server, "/healzth")[0] == 404
+        assert get(server, "/healthz")[0] == 200
         first.infer(request(0, goal_image=image(100)))
         first.close()
-        wait_until(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
-        with PlanningClient(running.url) as second, pytest.raises(InputError, match="no goal was set in this episode"):
+        wait_until(lambda: "vjepa2_ac_robots 0" in get(server, "/metrics")[1])
+        with PlanningClient(server.url) as second, pytest.raises(InputError, match="no goal was set in this episode"):
             second.infer(request(1))
 
 
@@ -156,29 +156,29 @@ def test_pings_are_answered_during_a_long_decision() -> None:
             slow.go.set()
             assert unpack(await connection.recv())["why"] == "planned"
 
-    with serving(lambda: slow.session) as running:
-        asyncio.run(ping_during_decision(running.url))
+    with serving(lambda: slow.session) as server:
+        asyncio.run(ping_during_decision(server.url))
 
 
 def test_disconnect_cancels_the_search_and_the_next_client_is_served() -> None:
     slow = SlowSession()
-    with serving(lambda: slow.session) as running:
-        with connect(running) as connection:
+    with serving(lambda: slow.session) as server:
+        with connect(server) as connection:
             connection.recv()
             connection.send(pack(request(0, goal_image=image(100))))
             assert slow.is_planning.wait(120)
         assert slow.is_cancelled.wait(120)
         slow.go.set()
-        wait_until(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
-        with PlanningClient(running.url) as client:
+        wait_until(lambda: "vjepa2_ac_robots 0" in get(server, "/metrics")[1])
+        with PlanningClient(server.url) as client:
             assert client.infer(request(1, goal_image=image(100)))["why"] == "planned"
 
 
 def test_server_shutdown_does_not_wait_for_a_decision() -> None:
     slow = SlowSession()
     with contextlib.ExitStack() as client:
-        with serving(lambda: slow.session) as running:
-            connection = client.enter_context(connect(running))
+        with serving(lambda: slow.session) as server:
+            connection = client.enter_context(connect(server))
             connection.recv()
             connection.send(pack(request(0, goal_image=image(100))))
             assert slow.is_planning.wait(120)
@@ -189,34 +189,32 @@ def test_server_shutdown_does_not_wait_for_a_decision() -> None:
 
 
 def test_key_is_required_for_robots_and_metrics_but_not_for_health_checks() -> None:
-    with serving(session, Access("127.0.0.1", KEY)) as running:
+    with serving(session, Access("127.0.0.1", KEY)) as server:
         for key in (None, KEY + "x"):
             with pytest.raises(UnreachableError, match="HTTP 401: a valid key is required"):
-                PlanningClient(running.url, key)
-        assert get(running, "/metrics")[0] == 401
-        assert get(running, "/metrics", Authorization=f"Api-Key {KEY}")[0] == 200
-        assert get(running, "/healthz")[0] == 200
-        with PlanningClient(running.url, KEY) as client:
+                PlanningClient(server.url, key)
+        assert get(server, "/metrics")[0] == 401
+        assert get(server, "/metrics", Authorization=f"Api-Key {KEY}")[0] == 200
+        assert get(server, "/healthz")[0] == 200
+        with PlanningClient(server.url, KEY) as client:
             assert client.infer(request(0, goal_image=image(1)))["why"] == "planned"
-        assert (
-            'connections_refused_total{status="401"} 3' in get(running, "/metrics", Authorization=f"Api-Key {KEY}")[1]
-        )
+        assert 'connections_refused_total{status="401"} 3' in get(server, "/metrics", Authorization=f"Api-Key {KEY}")[1]
 
 
 def test_requests_from_web_pages_are_rejected() -> None:
-    with serving(session) as running:
+    with serving(session) as server:
         for headers, status in (({"origin": "http://evil.example"}, 403), ({"origin": "null"}, 403)):
-            with pytest.raises(InvalidStatus) as caught, connect(running, **headers):
+            with pytest.raises(InvalidStatus) as caught, connect(server, **headers):
                 pass
             assert caught.value.response.status_code == status
-        assert get(running, "/metrics", Host="evil.example")[0] == 403
-        with connect(running) as connection:
+        assert get(server, "/metrics", Host="evil.example")[0] == 403
+        with connect(server) as connection:
             assert unpack(connection.recv()) == {}
 
 
 def test_invalid_message_gets_an_error_and_the_next_request_is_served() -> None:
     valid, rng = bytearray(pack(request(0, goal_image=image(100)))), random.Random(0)  # noqa: S311
-    with serving(session) as running, connect(running) as connection:
+    with serving(session) as server, connect(server) as connection:
         connection.recv()
         connection.send("a text")
         assert connection.recv(timeout=120) == "received a text message. Expected a binary message in msgpack"
@@ -230,23 +228,23 @@ def test_invalid_message_gets_an_error_and_the_next_request_is_served() -> None:
         connection.send(bytes(valid))
         reply = unpack(connection.recv(timeout=120))
         assert reply["why"] == "planned"
-        metrics = get(running, "/metrics")[1]
+        metrics = get(server, "/metrics")[1]
         assert "requests_failed_total 0" in metrics
         assert 'decisions_total{why="planned"} ' in metrics
         assert "decision_seconds_count" in metrics
 
 
 def test_too_large_message_closes_the_connection_but_not_the_server() -> None:
-    with serving(session) as running:
-        with connect(running) as connection:
+    with serving(session) as server:
+        with connect(server) as connection:
             connection.recv()
             with contextlib.suppress(ConnectionClosed, OSError):
                 connection.send(bytes(33 << 20))
             with pytest.raises(ConnectionClosed) as caught:
                 connection.recv(timeout=120)
         assert caught.value.rcvd is None or caught.value.rcvd.code == 1009
-        wait_until(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
-        with PlanningClient(running.url) as client:
+        wait_until(lambda: "vjepa2_ac_robots 0" in get(server, "/metrics")[1])
+        with PlanningClient(server.url) as client:
             assert client.infer(request(0, goal_image=image(1)))["why"] == "planned"
 
 
@@ -255,8 +253,8 @@ def test_server_shutdown_does_not_wait_for_uncancellable_work(monkeypatch: pytes
     served, is_replying, go = session(), threading.Event(), threading.Event()
     served.reply_to = lambda *_: (is_replying.set(), go.wait(120))[1]
     with contextlib.ExitStack() as client:
-        with serving(lambda: served) as running:
-            connection = client.enter_context(connect(running))
+        with serving(lambda: served) as server:
+            connection = client.enter_context(connect(server))
             connection.recv()
             connection.send(pack(request(0, endpoint="score")))
             assert is_replying.wait(120)
@@ -266,8 +264,8 @@ def test_server_shutdown_does_not_wait_for_uncancellable_work(monkeypatch: pytes
 
 def test_client_timeout_raises_and_closes_the_connection() -> None:
     slow = SlowSession()
-    with serving(lambda: slow.session) as running:
-        client = PlanningClient(running.url, timeout_s=0.1)
+    with serving(lambda: slow.session) as server:
+        client = PlanningClient(server.url, timeout_s=0.1)
         with pytest.raises(UnreachableError, match=r"no reply within 0\.1 s.*connect again"):
             client.infer(request(0, goal_image=image(100)))
         with pytest.raises(
@@ -280,5 +278,5 @@ def test_client_timeout_raises_and_closes_the_connection() -> None:
 
 @pytest.mark.parametrize("deadline_s", [5.0, 300.0])
 def test_client_timeout_is_longer_than_the_servers_deadline(deadline_s: float) -> None:
-    with serving(session, metadata={"deadline_s": deadline_s}) as running, PlanningClient(running.url) as client:
+    with serving(session, metadata={"deadline_s": deadline_s}) as server, PlanningClient(server.url) as client:
         assert client._timeout_s == max(120.0, 2 * deadline_s)

@@ -63,7 +63,7 @@ def test_policies_act_on_problems_that_the_expert_solves(
 def test_oracle_reaches_the_goal_in_an_external_environment() -> None:
     class Homing(ZeroActions):
         def reset(self, trial: Trial, goal_image: Image) -> None:  # noqa: ARG002
-            self.place = fake_world.place_of(trial.seed)
+            self.place = fake_world.draw_block_position(trial.seed)
 
         def _change(self, observation: Observation) -> np.ndarray:
             return np.append(self.place - observation.state[:3], np.zeros(4))

@@ -62,18 +62,18 @@ class Faults:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.set()
-        places = [(os, name) for name in ("mkdir", "rename", "replace", "fsync")]
-        for where, name in [*places, (Path, "write_text"), (Path, "write_bytes")]:
-            monkeypatch.setattr(where, name, self._failing(getattr(where, name)))
+        functions = [(os, name) for name in ("mkdir", "rename", "replace", "fsync")]
+        for owner, name in [*functions, (Path, "write_text"), (Path, "write_bytes")]:
+            monkeypatch.setattr(owner, name, self._failing(getattr(owner, name)))
 
     def set(self, number: int = -1, error: BaseException | None = None) -> None:
         """Restart the count of operations, and set the number of the operation that raises `error`."""
-        self.done, self._fails_at, self._error = 0, number, error
+        self.num_operations, self._fails_at, self._error = 0, number, error
 
     def _failing(self, real: Callable[..., Any]) -> Callable[..., Any]:
         def operation(*arguments: Any, **options: Any) -> Any:
-            self.done += 1
-            if self.done == self._fails_at and self._error is not None:
+            self.num_operations += 1
+            if self.num_operations == self._fails_at and self._error is not None:
                 raise self._error
             return real(*arguments, **options)
 

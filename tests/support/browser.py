@@ -35,7 +35,7 @@ def browser() -> str:
 def open_page(page: Path, folder: Path, *, dark: bool = False) -> Seen:
     """Open a page from its file; nothing outside this machine can be reached."""
     log = folder / "net.json"
-    done = subprocess.run(
+    process = subprocess.run(
         [
             browser(), "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
             "--host-resolver-rules=MAP * ~NOTFOUND", "--enable-logging=stderr", f"--log-net-log={log}",
@@ -44,8 +44,8 @@ def open_page(page: Path, folder: Path, *, dark: bool = False) -> Seen:
         ],
         capture_output=True, text=True, check=True, timeout=_TIMEOUT_S,
     )  # fmt: skip
-    console = tuple(line for line in done.stderr.splitlines() if ":CONSOLE" in line)
-    return Seen(done.stdout, console, _requests_of_the_page(log))
+    console = tuple(line for line in process.stderr.splitlines() if ":CONSOLE" in line)
+    return Seen(process.stdout, console, _requests_of_the_page(log))
 
 
 def _requests_of_the_page(log: Path) -> tuple[str, ...]:

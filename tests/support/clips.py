@@ -16,7 +16,7 @@ from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.episode import Batch, Clip, EpisodeSource
 
 
-def open_in_memory(source: Any, /, **options: Any) -> Dataset:
+def open_memory_source(source: Any, /, **options: Any) -> Dataset:
     """Open the data set of a source. By default all episodes are in the training split."""
     all_train = {"validation_share": 0.0, "test_share": 0.0, "workers": 0}
     values = {"path": "the set", "frames": 3, "stride": 2} | all_train | options
@@ -29,8 +29,8 @@ def dataset_in_memory(source: EpisodeSource, /, **options: Any) -> Dataset:
     """Return the data set of a source without filters."""
     config = DataConfig.model_validate({"path": "memory", "frames": 3, **options})
     table = EpisodeTable.from_infos(source.infos())
-    kept = StepSelection.all_steps(table, np.ones(len(table), bool))
-    return Dataset(config, source, table, kept, BrokenEpisodes(config, len(table)))
+    selection = StepSelection.all_steps(table, np.ones(len(table), bool))
+    return Dataset(config, source, table, selection, BrokenEpisodes(config, len(table)))
 
 
 def clip_at(dataset: Dataset, episode: int, start: int, *, camera: str | None = None) -> Clip:

@@ -20,11 +20,11 @@ SIZE = (24, 32)
 def write_npz(folder: Path, recordings: Sequence[int], **texts: Callable[[int], str]) -> Path:
     """Write episodes NNN.npz. Equal numbers give equal recordings; `texts` are functions of the episode's index."""
     folder.mkdir(parents=True, exist_ok=True)
-    for place, number in enumerate(recordings):
+    for index, number in enumerate(recordings):
         states = synthetic_states(STEPS, seed=number)
         frames = np.stack([draw_frame(state, size=SIZE) for state in states])
-        said = {name: np.array(text(place)) for name, text in texts.items()}
-        np.savez(folder / f"{place:03d}.npz", states=states, frames=frames, fps_hz=15.0, **said)
+        text_arrays = {name: np.array(text(index)) for name, text in texts.items()}
+        np.savez(folder / f"{index:03d}.npz", states=states, frames=frames, fps_hz=15.0, **text_arrays)
     return folder
 
 
@@ -32,12 +32,14 @@ def write_rlds(folder: Path, recordings: Sequence[int]) -> Path:
     """Write a data set in DROID's RLDS format. The names from the fifth episode on are longer than 127 bytes."""
 
     def episodes() -> list:  # type: ignore[type-arg]  # of DroidEpisode
-        made = []
-        for place, number in enumerate(recordings):
+        episodes_with_paths = []
+        for index, number in enumerate(recordings):
             drawn = synthetic_episode(number, steps=STEPS, size=SIZE)
-            name = f"/data/LAB{place % 2}/success/2023-01-{place + 1:02d}/{'again_' * 12 * (place > 3)}{place:04d}"
-            made.append(replace(drawn, file_path=f"{name}/trajectory.h5", recording_folderpath=f"{name}/recordings"))
-        return made
+            name = f"/data/LAB{index % 2}/success/2023-01-{index + 1:02d}/{'again_' * 12 * (index > 3)}{index:04d}"
+            episodes_with_paths.append(
+                replace(drawn, file_path=f"{name}/trajectory.h5", recording_folderpath=f"{name}/recordings")
+            )
+        return episodes_with_paths
 
     return write_droid_rlds(folder, iter(episodes()), shards=2)
 
@@ -49,10 +51,10 @@ def write_lerobot(folder: Path, recordings: Sequence[int]) -> Path:
 
 def write_raw(folder: Path, recordings: Sequence[int]) -> Path:
     """Write a data set in DROID's raw format."""
-    for place, number in enumerate(recordings):
+    for index, number in enumerate(recordings):
         states = synthetic_states(STEPS, seed=number)
         frames = {"1234": [draw_frame(state, size=SIZE) for state in states]}
-        write_raw_droid(folder / f"LAB/success/2023-07-{place + 1:02d}/{place:04d}", states, pictures=frames)
+        write_raw_droid(folder / f"LAB/success/2023-07-{index + 1:02d}/{index:04d}", states, pictures=frames)
     return folder
 
 

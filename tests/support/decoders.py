@@ -15,7 +15,7 @@ from vjepa2_ac.decoding.training import train_decoder
 from vjepa2_ac.encoding.latent_cache import EncoderOnDevice, encode_files
 from vjepa2_ac.model.checkpoints import load_base
 
-KNOBS = {"size": "tiny", "frames": 40, "steps": 6, "batch_size": 4, "learning_rate": 2e-3}
+OPTIONS = {"size": "tiny", "frames": 40, "steps": 6, "batch_size": 4, "learning_rate": 2e-3}
 EncodeSplit = Callable[..., FramePairs]
 
 
@@ -23,8 +23,8 @@ EncodeSplit = Callable[..., FramePairs]
 def make_decoder(make_config: MakeConfig, tmp_path: Path) -> MakeConfig:
     """A function that returns the config of a tiny decoder, with changed decoder options and other config keys."""
 
-    def make(folder: str = "decoder", knobs: dict | None = None, **changes: object) -> Config:
-        return make_config(decoder={**KNOBS, "folder": str(tmp_path / folder), **(knobs or {})}, **changes)
+    def make(folder: str = "decoder", options: dict | None = None, **changes: object) -> Config:
+        return make_config(decoder={**OPTIONS, "folder": str(tmp_path / folder), **(options or {})}, **changes)
 
     return make
 
@@ -35,7 +35,7 @@ def whole_decoder(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, b
     folder = tmp_path_factory.mktemp("whole") / "decoder"
     with one_thread():
         return train_decoder(
-            tiny_config(folder.parent / "run", data_folder, base_folder, decoder={**KNOBS, "folder": str(folder)})
+            tiny_config(folder.parent / "run", data_folder, base_folder, decoder={**OPTIONS, "folder": str(folder)})
         )
 
 

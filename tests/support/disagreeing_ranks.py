@@ -30,14 +30,15 @@ def measures_otherwise() -> None:
     """The validation errors of the ranks differ in the last digits, so that only one rank measures an improvement."""
     measure, times = validation.prediction_errors, [0]
 
-    def measured(*given: object, **named: object) -> object:
-        found = measure(*given, **named)
+    def measured(*arguments: object, **options: object) -> object:
+        errors = measure(*arguments, **options)
         times[0] += 1
         predicted = 0.5 * (1 - 1e-7 * RANK * times[0])
         arrays = {
-            key: np.full_like(one, 1.0 if key[0] == "persistence" else predicted) for key, one in found.arrays.items()
+            key: np.full_like(array, 1.0 if key[0] == "persistence" else predicted)
+            for key, array in errors.arrays.items()
         }
-        return replace(found, arrays=arrays)
+        return replace(errors, arrays=arrays)
 
     validation.prediction_errors = measured
 
@@ -57,10 +58,10 @@ def one_is_killed_once() -> None:
     """The launcher must restart all ranks."""
     step = loop.training_step
 
-    def killed(run: object, batches: object, number: int, **given: object) -> object:
+    def killed(run: object, batches: object, number: int, **options: object) -> object:
         if RANK == 1 and number == 3 and os.environ["TORCHELASTIC_RESTART_COUNT"] == "0":
             os.kill(os.getpid(), signal.SIGKILL)
-        return step(run, batches, number, **given)
+        return step(run, batches, number, **options)
 
     loop.training_step = killed
 
@@ -85,15 +86,15 @@ def indexing_takes_longer_than_the_time_out() -> None:
     torch.distributed.init_process_group("gloo", timeout=timedelta(seconds=6))
     if RANK == 0:
         make = setup.open_dataset
-        setup.open_dataset = lambda *given, **named: (time.sleep(9), make(*given, **named))[1]
+        setup.open_dataset = lambda *arguments, **options: (time.sleep(9), make(*arguments, **options))[1]
 
 
 def each_meets_another_broken_episode() -> None:
     """Two broken episodes are allowed, four are not."""
     make = training_loader
 
-    def loader(dataset: object, **given: object) -> object:
-        for batch in make(dataset, **given):  # type: ignore[arg-type]
+    def loader(dataset: object, **options: object) -> object:
+        for batch in make(dataset, **options):  # type: ignore[arg-type]
             for number in range(2):
                 dataset.dataset.broken.record(f"episode {2 * RANK + number}", "damaged")  # type: ignore[attr-defined]
             yield some_clips(batch, [0])

@@ -78,8 +78,8 @@ def _landscape(rng: np.random.Generator, episode_id: str, off: float) -> Landsca
     centre = true + off * rng.standard_normal(3)
     x, y, z = np.meshgrid(*axes, indexing="ij")
     energy = 0.4 + 0.002 * ((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + 0.5 * (z - centre[2]) ** 2)
-    place = np.unravel_index(energy.argmin(), energy.shape)
-    minimum = np.array([axes[axis][place[axis]] for axis in range(3)])
+    index = np.unravel_index(energy.argmin(), energy.shape)
+    minimum = np.array([axes[axis][index[axis]] for axis in range(3)])
     return Landscape(episode_id, 12, axes, energy, true, minimum)
 
 
@@ -91,7 +91,10 @@ def _landscapes(rng: np.random.Generator, ids: tuple[str, ...], off: float) -> L
 def _distribution(rng: np.random.Generator, ids: tuple[str, ...], spread: float, horizon: int) -> LatentDistribution:
     levels = [spread ** (h / horizon) + 0.1 * rng.standard_normal(len(ids)) for h in range(1, horizon + 1)]
     spreads = tuple(estimate_mean(level, ids) for level in levels)
-    mmd, variance = tuple(estimate_mean(1 - level, ids) for level in levels), tuple(2 * one.value for one in spreads)
+    mmd, variance = (
+        tuple(estimate_mean(1 - level, ids) for level in levels),
+        tuple(2 * spread_estimate.value for spread_estimate in spreads),
+    )
     return LatentDistribution(spreads, mmd, 1.5 - spread, variance, (2.0,) * horizon)
 
 
@@ -111,24 +114,26 @@ def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, mo
     )
 
 
-def page_of(one: Evaluation) -> str:
+def page_of(evaluation: Evaluation) -> str:
     """Return the report with the summary that the console shows."""
-    return render_page(one, summarize(one, make_rows(one)))
+    return render_page(evaluation, summarize(evaluation, make_rows(evaluation)))
 
 
-def decoded_strips(one: Evaluation, size: int = 64) -> Evaluation:
+def decoded_strips(evaluation: Evaluation, size: int = 64) -> Evaluation:
     """Return an evaluation with two decoded clips of a falling bar; in the second one the base sees it stand still."""
-    true = np.full((one.about.frames, size, size, 3), 90, np.uint8)
+    true = np.full((evaluation.about.frames, size, size, 3), 90, np.uint8)
     for time, frame in enumerate(true):
         frame[3 * time : size // 3 + 3 * time] = (200, 60, 40)
-    names = ("decoded_truth", *filter(None, (one.base, one.trained)))
+    names = ("decoded_truth", *filter(None, (evaluation.base, evaluation.trained)))
     rows = dict.fromkeys(("truth", *names), true)
-    both = (rows, rows | {names[1]: true[:1].repeat(len(true), axis=0)})
-    strips = tuple(DecodedStrip("median", one.clips.episode_ids[0], 0, shown) for shown in both)
-    psnr = (estimate_mean(np.linspace(20, 24, len(one.clips)), one.clips.episode_ids),) * one.horizon
+    strip_rows = (rows, rows | {names[1]: true[:1].repeat(len(true), axis=0)})
+    strips = tuple(DecodedStrip("median", evaluation.clips.episode_ids[0], 0, shown) for shown in strip_rows)
+    psnr = (
+        estimate_mean(np.linspace(20, 24, len(evaluation.clips)), evaluation.clips.episode_ids),
+    ) * evaluation.horizon
     curves = {(name, "psnr_db.whole.truth"): psnr for name in names}
     return replace(
-        one, decoded=DecodedRollouts({"folder": "decoder"}, names, curves, strips, fvd=dict.fromkeys(names, 0.4))
+        evaluation, decoded=DecodedRollouts({"folder": "decoder"}, names, curves, strips, fvd=dict.fromkeys(names, 0.4))
     )
 
 
@@ -143,12 +148,12 @@ def evaluation(
     ids = tuple(id_form.format(clip % episodes) for clip in range(clips))
     episode_of = np.arange(clips) % episodes
     names = [*(["base"] if with_base else []), *others, "adapter"]
-    nothing = _predicted(rng, "persistence", 1.0, horizon, episode_of)
+    persistence = _predicted(rng, "persistence", 1.0, horizon, episode_of)
     models = {}
-    for place, name in enumerate(names):
-        skill = (place + 1) / len(names)
+    for index, name in enumerate(names):
+        skill = (index + 1) / len(names)
         level = 1.1 - 0.4 * skill
-        arrays = nothing
+        arrays = persistence
         for actions, wrong in zip(ACTIONS, (1.0, 1.1, 1.2), strict=True):
             arrays = arrays | _predicted(rng, actions, level * wrong, horizon, episode_of)
         models[name] = ModelResult(
@@ -157,7 +162,7 @@ def evaluation(
             PredictionErrors(ids, arrays),
             _landscapes(rng, ids, 4 - 3 * skill),
             ranking=ranking_of(0.3 * (1 - skill) + 0.1 * rng.random(len(ids)), ids),
-            distribution=_distribution(np.random.default_rng(place), ids, 0.5 + 0.4 * skill, horizon),
+            distribution=_distribution(np.random.default_rng(index), ids, 0.5 + 0.4 * skill, horizon),
         )
     size_of_action = rng.gamma(2.0, 2.0, size=(clips, horizon))
     moving = size_of_action > 1.5

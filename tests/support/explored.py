@@ -18,12 +18,12 @@ from vjepa2_ac.simulation.counterfactual import SimulatedFutures
 QUICK = PlanningConfig(samples=12, iterations=2, planner={"name": "cem", "options": {"elites": 4}})
 
 
-def explorer_of(subject: Path, decoder: Path, asked: EvaluationOptions) -> tuple[Explorer, Config]:
+def explorer_of(subject: Path, decoder: Path, options: EvaluationOptions) -> tuple[Explorer, Config]:
     """Return an explorer as the command opens it, and its config."""
-    config = resolve_config(str(subject), asked)
+    config = resolve_config(str(subject), options)
 
     def load(dataset: Dataset, decoder: TrainedDecoder) -> LoadedModels:
-        return load_models(str(subject), config, asked, dataset, decoder)
+        return load_models(str(subject), config, options, dataset, decoder)
 
     return open_explorer(config, load_decoder(decoder), "test", load, SimulatedFutures.of), config
 

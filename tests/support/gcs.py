@@ -67,22 +67,22 @@ class Gcs:
         self.most_in_flight = 0
         self._meeting = _Meeting(0, "")
 
-    def upload(self, source: Path, place: str) -> str:
+    def upload(self, source: Path, path: str) -> str:
         """Put a file, or all files of a folder, at "bucket" or "bucket/prefix"; return the gs:// URL of it."""
         files = [source] if source.is_file() else [path for path in sorted(source.rglob("*")) if path.is_file()]
         for file in files:
-            self.put(f"{place}/{file.relative_to(source).as_posix()}" if source.is_dir() else place, file.read_bytes())
-        return f"gs://{place}"
+            self.put(f"{path}/{file.relative_to(source).as_posix()}" if source.is_dir() else path, file.read_bytes())
+        return f"gs://{path}"
 
-    def put(self, place: str, data: bytes) -> str:
+    def put(self, path: str, data: bytes) -> str:
         """Put bytes at "bucket/name" without a request; return the gs:// URL."""
-        bucket, _, name = place.partition("/")
+        bucket, _, name = path.partition("/")
         about = _make_object_resource("", bucket, name, "application/octet-stream", str(len(data)))
         with self._one_at_a_time:
             if bucket not in self._storage.buckets:
                 self._storage.create_bucket(bucket, _make_bucket_resource(bucket))
             self._storage.create_file(bucket, name, data, _checksums(data, about))
-        return f"gs://{place}"
+        return f"gs://{path}"
 
     def fail_next(self, failure: Failure, *, times: int = 1, match: str = "") -> None:
         """Make the next requests fail.
@@ -200,11 +200,11 @@ class _Handler(RequestHandler):
                 failure = 499  # Google's answer to a cancelled upload, which the emulator does not implement
             if failure == "hang":
                 connection.read()
-            answer, sent = self._result(failure, body)
+            response, sent = self._result(failure, body)
             gcs.requests.append(Request(target, _object_of(self.path), sent))
         finally:
             gcs._count(-1)
-        self.wfile.write(answer)
+        self.wfile.write(response)
         self.close_connection = failure in {"reset", "cut", "hang"}
 
     do_GET = do_POST = do_DELETE = do_PUT = do_PATCH = _answer  # noqa: N815 - the names that http.server calls
@@ -231,5 +231,5 @@ class _Handler(RequestHandler):
 
 def _object_of(address: str) -> str:
     parts = urlsplit(address)
-    found = re.search(r"/b/([^/]+)/o/([^/?]+)$", parts.path)
-    return f"{found[1]}/{unquote(found[2])}" if found and parse_qs(parts.query).get("alt") == ["media"] else ""
+    match = re.search(r"/b/([^/]+)/o/([^/?]+)$", parts.path)
+    return f"{match[1]}/{unquote(match[2])}" if match and parse_qs(parts.query).get("alt") == ["media"] else ""

@@ -70,12 +70,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         path = unquote(urlsplit(self.path).path)
-        if found := _FILE.fullmatch(path):
-            self._file(found["name"], found["path"])
-        elif found := _TREE.fullmatch(path):
-            self._tree(found["name"], found["path"] or "")
-        elif (found := _API.fullmatch(path)) and found["name"] in self.hub.datasets:
-            self._about(found["name"], found["revision"] or "main")
+        if match := _FILE.fullmatch(path):
+            self._file(match["name"], match["path"])
+        elif match := _TREE.fullmatch(path):
+            self._tree(match["name"], match["path"] or "")
+        elif (match := _API.fullmatch(path)) and match["name"] in self.hub.datasets:
+            self._about(match["name"], match["revision"] or "main")
         else:
             self._json(401, {"error": "Invalid username or password."}, "RepoNotFound")
 

@@ -12,11 +12,11 @@ def install(python: str | Path, *words: str) -> None:
     """Install packages for a Python interpreter; skip the test if they cannot be installed."""
     pip = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--disable-pip-version-check"]
     try:
-        done = subprocess.run([*pip, *words], capture_output=True, text=True, timeout=180)
+        process = subprocess.run([*pip, *words], capture_output=True, text=True, timeout=180)
     except subprocess.TimeoutExpired:
         pytest.skip(f"{words} could not be installed within 3 minutes")
-    if done.returncode:
-        pytest.skip(f"{words} cannot be installed here: {done.stderr.strip().splitlines()[-1:]}")
+    if process.returncode:
+        pytest.skip(f"{words} cannot be installed here: {process.stderr.strip().splitlines()[-1:]}")
 
 
 def leave_package(folder: Path, package: str, entry_points: str, code: str = "thing = print\n") -> None:

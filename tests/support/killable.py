@@ -46,14 +46,14 @@ class Nursery:
 
         Standard output is written to the file `out`, standard error to the file `err` or that of this process.
         """
-        wish = {"arguments": arguments, "folder": str(folder), "die_at": die_at, "out": out, "err": err}
-        return Child(self._ask(wish), self)
+        request = {"arguments": arguments, "folder": str(folder), "die_at": die_at, "out": out, "err": err}
+        return Child(self._ask(request), self)
 
     def start_script(self, *words: str, environment: dict[str, str], out: str, err: str) -> Child:
         """Start `python SCRIPT …`, or `python -m vjepa2_ac.cli …`, in the current folder with another environment."""
-        wish = {"die_at": None, "out": out, "err": err, "environment": environment, "cwd": str(Path.cwd())}
-        wish |= {"arguments": words[2:]} if words[0] == "-m" else {"script": words[0], "arguments": words[1:]}
-        return Child(self._ask(wish), self)
+        request = {"die_at": None, "out": out, "err": err, "environment": environment, "cwd": str(Path.cwd())}
+        request |= {"arguments": words[2:]} if words[0] == "-m" else {"script": words[0], "arguments": words[1:]}
+        return Child(self._ask(request), self)
 
     def run(self, *words: str, folder: Path) -> subprocess.CompletedProcess[str]:
         """Run a script as `start_script` does, in this environment, and wait; `folder` stores the output."""
@@ -72,20 +72,20 @@ class Nursery:
         self._process.stdout.close()
         self._process.wait(timeout=120)
 
-    def _ask(self, what: dict) -> int:
-        self._process.stdin.write(json.dumps(what) + "\n")
+    def _ask(self, request: dict) -> int:
+        self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
-        answer = self._process.stdout.readline()
-        assert answer, "the nursery is gone"
-        return int(answer)
+        reply = self._process.stdout.readline()
+        assert reply, "the nursery is gone"
+        return int(reply)
 
 
 @cache
 def nursery() -> Nursery:
     """Return the nursery of this test process, which exists until the process exits."""
-    made = Nursery()
-    atexit.register(made.close)
-    return made
+    process = Nursery()
+    atexit.register(process.close)
+    return process
 
 
 @dataclass(frozen=True)
@@ -141,13 +141,13 @@ def _serve() -> None:
     torch.set_num_threads(1)
     gc.freeze()  # no child looks for garbage in what is there, nor copies it so
     for line in sys.stdin:
-        wish = json.loads(line)
-        if "wait" in wish:
-            _tell(os.waitstatus_to_exitcode(os.waitpid(wish["wait"], 0)[1]))
+        request = json.loads(line)
+        if "wait" in request:
+            _tell(os.waitstatus_to_exitcode(os.waitpid(request["wait"], 0)[1]))
             continue
         child = os.fork()
         if child == 0:
-            _become(wish, main)
+            _become(request, main)
         _tell(child)
 
 
@@ -156,7 +156,7 @@ def _tell(number: int) -> None:
     sys.stdout.flush()
 
 
-def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
+def _become(request: dict, main: Callable[[list[str]], int]) -> None:
     """Run a command in this forked process, and exit."""
     status = 1
     try:
@@ -164,19 +164,19 @@ def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
         for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP):  # as from a terminal, even under `nohup`
             signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        output.LAST_S = 0.5 if Path(wish["out"]).is_fifo() else 120.0  # a pipe has a reader who may never read
+        output.LAST_S = 0.5 if Path(request["out"]).is_fifo() else 120.0  # a pipe has a reader who may never read
         os.dup2(os.open(os.devnull, os.O_RDWR), 0)
-        os.dup2(os.open(wish["out"], os.O_WRONLY | os.O_NOCTTY), 1)
-        if wish["err"] is not None:
-            os.dup2(os.open(wish["err"], os.O_WRONLY | os.O_NOCTTY), 2)
+        os.dup2(os.open(request["out"], os.O_WRONLY | os.O_NOCTTY), 1)
+        if request["err"] is not None:
+            os.dup2(os.open(request["err"], os.O_WRONLY | os.O_NOCTTY), 2)
         faulthandler.dump_traceback_later(900, exit=True)  # no test waits for ever, and it says for what
-        if wish["die_at"] is not None:
-            _die_at(wish["die_at"], wish["folder"])
-        if "environment" in wish:
+        if request["die_at"] is not None:
+            _die_at(request["die_at"], request["folder"])
+        if "environment" in request:
             os.environ.clear()
-            os.environ.update(wish["environment"])
-            os.chdir(wish["cwd"])
-        status = _script(wish) if "script" in wish else main(wish["arguments"])
+            os.environ.update(request["environment"])
+            os.chdir(request["cwd"])
+        status = _script(request) if "script" in request else main(request["arguments"])
     except SystemExit as ended:
         status = int(ended.code or 0)
     finally:
@@ -185,11 +185,11 @@ def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
         os._exit(status)
 
 
-def _script(wish: dict) -> int:
-    sys.argv = [wish["script"], *wish["arguments"]]
-    sys.path.insert(0, str(Path(wish["script"]).parent))
+def _script(request: dict) -> int:
+    sys.argv = [request["script"], *request["arguments"]]
+    sys.path.insert(0, str(Path(request["script"]).parent))
     try:
-        runpy.run_path(wish["script"], run_name="__main__")
+        runpy.run_path(request["script"], run_name="__main__")
     except SystemExit:
         raise
     except BaseException:

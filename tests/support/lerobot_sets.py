@@ -52,7 +52,7 @@ def recorded(number: int, steps: int, *, size: tuple[int, int] = SIZE) -> Record
     }
     frames = {
         f"observation.images.{name}": [
-            numbered(draw_frame(state, size=size, camera=camera), number, step, camera)
+            draw_numbers(draw_frame(state, size=size, camera=camera), number, step, camera)
             for step, state in enumerate(states)
         ]
         for camera, name in enumerate(CAMERAS)
@@ -60,7 +60,7 @@ def recorded(number: int, steps: int, *, size: tuple[int, int] = SIZE) -> Record
     return Recorded(columns, frames, task=f"move to place {number % 2}")
 
 
-def numbered(frame: UInt8[np.ndarray, "height width 3"], *numbers: int) -> UInt8[np.ndarray, "height width 3"]:
+def draw_numbers(frame: UInt8[np.ndarray, "height width 3"], *numbers: int) -> UInt8[np.ndarray, "height width 3"]:
     """Return an image with numbers below 256 in its upper rows, as black and white blocks that a codec preserves."""
     frame = frame.copy()
     for row, number in enumerate(numbers):
@@ -71,9 +71,9 @@ def numbered(frame: UInt8[np.ndarray, "height width 3"], *numbers: int) -> UInt8
 
 
 def numbers_of(frame: UInt8[np.ndarray, "height width 3"], count: int = 3) -> tuple[int, ...]:
-    """Return the numbers that `numbered` drew."""
+    """Return the numbers that `draw_numbers` drew."""
     bits = frame[_BLOCK // 2 :: _BLOCK, _BLOCK // 2 :: _BLOCK].mean(axis=-1)[:count, :8] > 127
-    return tuple(int(sum(1 << place for place in np.flatnonzero(row))) for row in bits)
+    return tuple(int(sum(1 << bit for bit in np.flatnonzero(row))) for row in bits)
 
 
 def write_v30(
@@ -140,10 +140,10 @@ def change_table(path: Path, **columns: object) -> None:
     """Replace columns of a Parquet file, or remove them (None)."""
     table = pq.read_table(path)
     for name, values in columns.items():
-        place = table.schema.get_field_index(name)
-        table = table.remove_column(place)
+        index = table.schema.get_field_index(name)
+        table = table.remove_column(index)
         if values is not None:
-            table = table.add_column(place, name, values)
+            table = table.add_column(index, name, values)
     _write_table(path, table)
 
 

@@ -33,8 +33,8 @@ def spot_frames(states: Float[np.ndarray, "steps 7"]) -> UInt8[np.ndarray, "step
     rows, columns = np.mgrid[0:ROWS, 0:COLUMNS]
     down, right = 12 - 12 * (states[:, 0] - 0.5), 16 + 12 * states[:, 1]
     distance = (rows - down[:, None, None]) ** 2 + (columns - right[:, None, None]) ** 2
-    spot = 160 * np.exp(-distance / (8 + 40 * states[:, 2, None, None] ** 2))
-    return np.stack([70 + spot, 60 + spot, 20 + spot], axis=-1).clip(0, 255).astype(np.uint8)
+    brightness = 160 * np.exp(-distance / (8 + 40 * states[:, 2, None, None] ** 2))
+    return np.stack([70 + brightness, 60 + brightness, 20 + brightness], axis=-1).clip(0, 255).astype(np.uint8)
 
 
 def spot_excerpt(

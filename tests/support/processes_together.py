@@ -35,8 +35,8 @@ def batches(run: Run, read: list[list[int]]) -> Iterator[Batch]:
 
 def gradient_of(run: Run, read: list[list[int]]) -> tuple[object, list[torch.Tensor]]:
     run.optimizer.zero_grad(set_to_none=True)
-    taken = compute_gradients(run, batches(run, read))
-    return taken, [p.grad for p in run.world_model.parameters() if p.grad is not None]
+    micro_step = compute_gradients(run, batches(run, read))
+    return micro_step, [p.grad for p in run.world_model.parameters() if p.grad is not None]
 
 
 def main() -> None:
@@ -58,38 +58,39 @@ def main() -> None:
     assert run_on_first(accelerator, lambda: "done") == (None if rank else "done")
 
     run = set_up(config, SILENT, accelerator=accelerator)
-    first = run.world_model.predictor.state_dict()
+    weights = run.world_model.predictor.state_dict()
     assert all(
-        all(torch.equal(one, other) for one in all_gather_object(accelerator, other)) for other in first.values()
+        all(torch.equal(gathered, weight) for gathered in all_gather_object(accelerator, weight))
+        for weight in weights.values()
     )
     # The second process cannot read its last micro-batch: the mean is over the five clips that came.
-    taken, together = gradient_of(run, [[0, 1], [0]] if rank == 0 else [[0, 1], []])
-    assert taken.clips == 5
-    together = [gradient.clone() for gradient in together]
+    pair_step, pair_gradients = gradient_of(run, [[0, 1], [0]] if rank == 0 else [[0, 1], []])
+    assert pair_step.clips == 5
+    pair_gradients = [gradient.clone() for gradient in pair_gradients]
     # Both read what the pair read: each clip counts twice, in the sum and in the number.
-    taken_alone, alone = gradient_of(run, [[0, 1], [0]])
-    taken_other, other = gradient_of(run, [[0, 1], []])
-    for pair, mine, theirs in zip(together, alone, other, strict=True):
-        torch.testing.assert_close(pair, (mine * 3 + theirs * 2) / 5, rtol=1e-4, atol=1e-7)
-    expected = (taken_alone.forced_loss * 3 + taken_other.forced_loss * 2) / 5
-    assert abs(taken.forced_loss - expected) < 1e-6
-    nothing, none = gradient_of(run, [[], []])
-    assert nothing.clips == 0
-    assert none == []
-    one_has_none, _ = gradient_of(run, [[0, 1], [0, 1]] if rank == 0 else [[], []])
-    assert one_has_none.clips == 4
+    first_step, first_gradients = gradient_of(run, [[0, 1], [0]])
+    second_step, second_gradients = gradient_of(run, [[0, 1], []])
+    for pair, first, second in zip(pair_gradients, first_gradients, second_gradients, strict=True):
+        torch.testing.assert_close(pair, (first * 3 + second * 2) / 5, rtol=1e-4, atol=1e-7)
+    expected = (first_step.forced_loss * 3 + second_step.forced_loss * 2) / 5
+    assert abs(pair_step.forced_loss - expected) < 1e-6
+    empty_step, empty_gradients = gradient_of(run, [[], []])
+    assert empty_step.clips == 0
+    assert empty_gradients == []
+    uneven_step, _ = gradient_of(run, [[0, 1], [0, 1]] if rank == 0 else [[], []])
+    assert uneven_step.clips == 4
 
-    # What only the first process has on its disk, all go on from.
+    # All processes resume from a checkpoint that only the first process has on its disk.
     run.optimizer.zero_grad(set_to_none=True)
     training_step(run, batches(run, [[0, 1], [0, 1]]), step=1)
     run.state = replace(run.state, step=1, clips_done=8)
     save_checkpoint(run, Path(config.run_dir))
     own_disk = config.model_copy(update={"run_dir": config.run_dir if rank == 0 else f"{config.run_dir}-elsewhere"})
-    again = set_up(own_disk, SILENT, accelerator=accelerator)
-    assert (again.state.step, again.state.clips_done, again.state.run_id) == (1, 8, run.state.run_id)
-    for before, after in zip(run.world_model.parameters(), again.world_model.parameters(), strict=True):
+    resumed = set_up(own_disk, SILENT, accelerator=accelerator)
+    assert (resumed.state.step, resumed.state.clips_done, resumed.state.run_id) == (1, 8, run.state.run_id)
+    for before, after in zip(run.world_model.parameters(), resumed.world_model.parameters(), strict=True):
         assert torch.equal(before, after)
-    moments, expected_moments = again.optimizer.state_dict()["state"], run.optimizer.state_dict()["state"]
+    moments, expected_moments = resumed.optimizer.state_dict()["state"], run.optimizer.state_dict()["state"]
     assert moments.keys() == expected_moments.keys() != set()
     assert all(
         torch.equal(value, moments[key][name]) for key, own in expected_moments.items() for name, value in own.items()

@@ -63,8 +63,8 @@ class Rank:
 
 def start_rank(words: list[str], rank: int, processes: int, port: int, **more: str) -> Rank:
     """Start one process of a run, as srun does; `more` are additional environment variables."""
-    place = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": processes, "LOCAL_WORLD_SIZE": processes}
-    environment = {**os.environ, **{name: str(value) for name, value in place.items()}, "OMP_NUM_THREADS": "1"}
+    rank_variables = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": processes, "LOCAL_WORLD_SIZE": processes}
+    environment = {**os.environ, **{name: str(value) for name, value in rank_variables.items()}, "OMP_NUM_THREADS": "1"}
     environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), **more}
     return Rank(words, environment)
 
@@ -78,21 +78,21 @@ def run_ranks(words: list[str], processes: int = 2, status: int = 0, timeout: fl
 def finish(processes: list, status: int = 0, timeout: float = 120.0) -> list[tuple[str, str]]:
     """Wait for all processes, and kill them after the timeout; return the output and error output of each."""
     try:
-        said = [process.communicate(timeout=timeout) for process in processes]
+        outputs = [process.communicate(timeout=timeout) for process in processes]
     finally:
         for process in processes:
             process.kill()
         for process in processes:
             process.communicate()  # of those that hung; their pipes are closed so
-    assert [process.returncode for process in processes] == [status] * len(processes), said
-    return said
+    assert [process.returncode for process in processes] == [status] * len(processes), outputs
+    return outputs
 
 
 def wait_until(happened: Callable[[], T], processes: Sequence = (), timeout_s: float = 300.0) -> T:
     """Wait until `happened` returns a true value, and return the value; no process may exit earlier."""
     until = time.monotonic() + timeout_s
-    while not (found := happened()):
+    while not (outcome := happened()):
         assert all(process.poll() is None for process in processes), finish([*processes])
         assert time.monotonic() < until
         time.sleep(0.02)
-    return found
+    return outcome

@@ -57,16 +57,16 @@ def _nested(features: Mapping[str, Any]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for name, feature in features.items():
         *folders, last = name.split("/")
-        place = tree
+        node = tree
         for part in folders:
-            place = place.setdefault(part, {})
-        place[last] = feature
+            node = node.setdefault(part, {})
+        node[last] = feature
     return _described(tree)
 
 
 def _described(tree: Any) -> dict[str, Any]:
     if isinstance(tree, dict):
-        inner = {name: _described(one) for name, one in tree.items()}
+        inner = {name: _described(subtree) for name, subtree in tree.items()}
         inner |= {"steps": {"sequence": {"feature": inner["steps"], "length": "-1"}}} if "steps" in inner else {}
         return {"featuresDict": {"features": inner}}
     if tree == "text":

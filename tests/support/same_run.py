@@ -34,32 +34,32 @@ def metrics(run: Path) -> list[dict]:
     return [{k: v for k, v in row.items() if k not in TIMINGS} for row in rows]
 
 
-def numbers_in(state: dict, place: str = "") -> dict[str, torch.Tensor]:
+def numbers_in(state: dict, prefix: str = "") -> dict[str, torch.Tensor]:
     """Return all numbers of nested dicts by their dotted keys; 8-bit moments are nested."""
-    inner = [numbers_in(value, f"{place}{key}.") for key, value in state.items() if isinstance(value, dict)]
-    own = {f"{place}{key}": torch.as_tensor(value) for key, value in state.items() if not isinstance(value, dict)}
-    return {name: value for numbers in (own, *inner) for name, value in numbers.items()}
+    inner = [numbers_in(value, f"{prefix}{key}.") for key, value in state.items() if isinstance(value, dict)]
+    tensors = {f"{prefix}{key}": torch.as_tensor(value) for key, value in state.items() if not isinstance(value, dict)}
+    return {name: value for numbers in (tensors, *inner) for name, value in numbers.items()}
 
 
-def assert_same_run(one: Path, other: Path) -> None:
+def assert_same_run(run: Path, other_run: Path) -> None:
     for first, second in (
-        (all_weights(one), all_weights(other)),
-        (numbers_in(optimizer_state(one)), numbers_in(optimizer_state(other))),
+        (all_weights(run), all_weights(other_run)),
+        (numbers_in(optimizer_state(run)), numbers_in(optimizer_state(other_run))),
     ):
         assert first
         assert first.keys() == second.keys()
         for name, value in first.items():
             assert torch.equal(value, second[name]), name
-    assert metrics(one) == metrics(other)
+    assert metrics(run) == metrics(other_run)
 
 
-def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
+def assert_equal_up_to_rounding(run: Path, other_run: Path) -> None:
     """Compare two runs with different numbers of processes, whose sums have another order."""
-    first, second = trained_weights(one), trained_weights(other)
+    first, second = trained_weights(run), trained_weights(other_run)
     for name, value in first.items():
         torch.testing.assert_close(second[name], value, rtol=1e-3, atol=1e-6, msg=name)
-    for row, same in zip(metrics(one), metrics(other), strict=True):
-        assert row["step"] == same["step"]
+    for row, other_row in zip(metrics(run), metrics(other_run), strict=True):
+        assert row["step"] == other_row["step"]
         if row["kind"] == "train":
-            assert same["loss"] == pytest.approx(row["loss"], rel=1e-5)
-            assert same["grad_norm"] == pytest.approx(row["grad_norm"], rel=1e-4)
+            assert other_row["loss"] == pytest.approx(row["loss"], rel=1e-5)
+            assert other_row["grad_norm"] == pytest.approx(row["grad_norm"], rel=1e-4)

@@ -31,7 +31,7 @@ def request(seed: int = 0, **more: object) -> dict:
     return {"observation/image": image(seed), "observation/state": STATE} | keys
 
 
-class Running:
+class ServerAddress:
     """The addresses of a running server."""
 
     def __init__(self, url: str) -> None:
@@ -82,7 +82,7 @@ def run_in_thread(
 @contextmanager
 def serving(
     load: Callable[[], Session], access: Access | None = None, metadata: dict | None = None
-) -> Iterator[Running]:
+) -> Iterator[ServerAddress]:
     """Run a planning server during the `with` block."""
 
     def serve(stop: asyncio.Event, print_status: Callable[[str], None]) -> Awaitable[object]:
@@ -91,7 +91,7 @@ def serving(
         )
 
     with run_in_thread(serve, "listening on ") as lines:
-        yield Running(lines[0].removeprefix("listening on "))
+        yield ServerAddress(lines[0].removeprefix("listening on "))
 
 
 def start_server(*arguments: str) -> tuple[Rank, str]:

@@ -19,20 +19,22 @@ def install(modules: list[str], typechecker: str) -> None:
     jaxtyped = jaxtyping.jaxtyped
 
     def decorator(*, typechecker: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda thing: jaxtyped(thing, typechecker=typechecker) if has_shapes(thing) else thing
+        return lambda definition: (
+            jaxtyped(definition, typechecker=typechecker) if has_shapes(definition) else definition
+        )
 
     jaxtyping.jaxtyped = decorator  # the decorator that the import hook uses
     jaxtyping.install_import_hook(modules, typechecker)
 
 
-def has_shapes(thing: Any) -> bool:
+def has_shapes(definition: Any) -> bool:
     """Return whether a function, a method, a property or a record has an array among its annotations."""
-    thing = getattr(thing, "fget", None) or getattr(thing, "__func__", thing)
-    if inspect.isclass(thing):
-        names: Mapping[str, Any] = vars(sys.modules[thing.__module__])
-        annotations = [value for kind in thing.__mro__ for value in vars(kind).get("__annotations__", {}).values()]
+    definition = getattr(definition, "fget", None) or getattr(definition, "__func__", definition)
+    if inspect.isclass(definition):
+        names: Mapping[str, Any] = vars(sys.modules[definition.__module__])
+        annotations = [value for kind in definition.__mro__ for value in vars(kind).get("__annotations__", {}).values()]
     else:
-        names, annotations = thing.__globals__, [*thing.__annotations__.values()]
+        names, annotations = definition.__globals__, [*definition.__annotations__.values()]
     return any(_is_array(annotation, names) for annotation in annotations)
 
 
@@ -41,4 +43,4 @@ def _is_array(annotation: Any, names: Mapping[str, Any]) -> bool:
         return any(_is_array(names[word], {}) for word in re.findall(r"\w+", annotation) if word in names)
     if inspect.isclass(annotation) and issubclass(annotation, jaxtyping.AbstractArray | jaxtyping.AbstractDtype):
         return True
-    return any(_is_array(one, names) for one in get_args(annotation))
+    return any(_is_array(argument, names) for argument in get_args(annotation))

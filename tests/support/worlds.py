@@ -77,15 +77,15 @@ def clips_batch(clips: int = 12, seed: int = 0, width: int = 7, actions: Tensor 
     return LatentBatch(latents, states, actions, None, ids, tuple(range(clips)))
 
 
-def rows(batch: LatentBatch, places: list[int]) -> LatentBatch:
+def rows(batch: LatentBatch, indices: list[int]) -> LatentBatch:
     """Return some clips of a batch."""
     return LatentBatch(
-        batch.latents[places],
-        batch.states[places],
-        batch.actions[places],
+        batch.latents[indices],
+        batch.states[indices],
+        batch.actions[indices],
         None,
-        tuple(batch.episode_ids[place] for place in places),
-        tuple(batch.starts[place] for place in places),
+        tuple(batch.episode_ids[index] for index in indices),
+        tuple(batch.starts[index] for index in indices),
     )
 
 
@@ -95,16 +95,16 @@ def in_batches(batch: LatentBatch, size: int) -> list[LatentBatch]:
     return [rows(batch, list(range(first, min(first + size, count)))) for first in range(0, count, size)]
 
 
-def again(batch: LatentBatch, size: int = 4, space: ActionSpace = POSE_CHANGE) -> RepeatableClips:
+def repeatable_clips(batch: LatentBatch, size: int = 4, space: ActionSpace = POSE_CHANGE) -> RepeatableClips:
     """Return clips that can be read several times, with grey images."""
-    places = {name: place for place, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True))}
+    indices = {name: index for index, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True))}
 
     def read(names):  # type: ignore[no-untyped-def]
-        chosen = list(places.values()) if names is None else [places[name] for name in names]
+        chosen = list(indices.values()) if names is None else [indices[name] for name in names]
         for part in in_batches(rows(batch, chosen), size):
             yield part, lambda _: np.full((TIME, 8, 8, 3), 128, np.uint8)
 
-    return RepeatableClips(tuple(places), read, space)
+    return RepeatableClips(tuple(indices), read, space)
 
 
 def about(**changes: object) -> About:
