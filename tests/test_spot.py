@@ -24,25 +24,25 @@ from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
 
 SKYPILOT, KUBERNETES = (ROOT / f"scripts/spot_{name}.yaml" for name in ("skypilot", "kubernetes"))
-PLACE, STEPS = "gs://bucket/run", 40
+REMOTE_URL, STEPS = "gs://bucket/run", 40
 
 
-def of_kubernetes() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+def read_kubernetes_job() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Return the service, the specification of the job, and that of its pods."""
     service, job = yaml.safe_load_all(KUBERNETES.read_text())
     return service, job["spec"], job["spec"]["template"]["spec"]
 
 
-def words_in_a_pod() -> list[str]:
-    return [str(word) for word in of_kubernetes()[2]["containers"][0]["command"]]
+def command_in_a_pod() -> list[str]:
+    return [str(word) for word in read_kubernetes_job()[2]["containers"][0]["command"]]
 
 
-def words_on_a_machine_of_skypilot(folder: Path) -> list[str]:
+def command_on_a_skypilot_machine(folder: Path) -> list[str]:
     """Run the script of the file with a torchrun that only records its arguments."""
     (folder / "torchrun").write_text('#!/bin/bash\nprintf "%s\\n" torchrun "$@" >words\n')
     (folder / "torchrun").chmod(0o755)
     task = yaml.safe_load(SKYPILOT.read_text())
-    variables = {**task["envs"], "REMOTE": PLACE, "SKYPILOT_NUM_NODES": "2", "SKYPILOT_NODE_RANK": "1"}
+    variables = {**task["envs"], "REMOTE": REMOTE_URL, "SKYPILOT_NUM_NODES": "2", "SKYPILOT_NODE_RANK": "1"}
     variables |= {"SKYPILOT_NUM_GPUS_PER_NODE": "4", "SKYPILOT_NODE_IPS": "10.0.0.1\n10.0.0.2"}
     environment = {**os.environ, **variables, "PATH": f"{folder}:{os.environ['PATH']}"}
     subprocess.run(["bash", "-e", "-c", task["run"]], env=environment, cwd=folder, check=True)
@@ -53,13 +53,13 @@ def words_on_a_machine_of_skypilot(folder: Path) -> list[str]:
 def test_commands_of_the_files_are_valid_and_uploads_have_time(where: str, tmp_path: Path) -> None:
     from torch.distributed.run import config_from_args, parse_args
 
-    words = words_in_a_pod() if where == "kubernetes" else words_on_a_machine_of_skypilot(tmp_path)
+    words = command_in_a_pod() if where == "kubernetes" else command_on_a_skypilot_machine(tmp_path)
     options = parse_args(words[1:])
     launch, (command, config, *overrides) = config_from_args(options)[0], options.training_script_args
     assert (words[0], options.training_script, command) == ("torchrun", "vjepa2_ac.cli", "train")
     read = load_config(config if config.startswith("builtin:") else ROOT / config, overrides).checkpoint
     assert str(read.remote).startswith("gs://")
-    notice_s = of_kubernetes()[2]["terminationGracePeriodSeconds"] if where == "kubernetes" else 30
+    notice_s = read_kubernetes_job()[2]["terminationGracePeriodSeconds"] if where == "kubernetes" else 30
     assert read.remote_wait_seconds < launch.shutdown_timeout < notice_s
     assert {"SIGTERM", "SIGUSR1"} <= set(launch.signals_to_handle.split(","))
     assert launch.min_nodes == launch.max_nodes == 2
@@ -100,10 +100,10 @@ class Pods:
         self._chdir(machine)
         variables = {
             "torchrun": str(ROOT / "tests/support/torchrun_forked.py"), "builtin:default": self._config,
-            "checkpoint.remote=gs://my-bucket/my-run": f"checkpoint.remote={PLACE}",
+            "checkpoint.remote=gs://my-bucket/my-run": f"checkpoint.remote={REMOTE_URL}",
             "--rdzv-endpoint=vjepa2-ac-0.vjepa2-ac:29500": f"--rdzv-endpoint=127.0.0.1:{self._port}",
         }  # fmt: skip
-        words = [variables.get(word, word) for word in words_in_a_pod()]
+        words = [variables.get(word, word) for word in command_in_a_pod()]
         words[1:1] = ["--local-addr=127.0.0.1", f"--node-rank={index}"]
         return Rank(words, {**os.environ, "OMP_NUM_THREADS": "1"})
 

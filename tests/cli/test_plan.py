@@ -145,9 +145,9 @@ WRONG = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("more", "complaint"), WRONG.values(), ids=WRONG.keys())
+@pytest.mark.parametrize(("more", "message"), WRONG.values(), ids=WRONG.keys())
 def test_invalid_input_prints_one_error_and_writes_no_plan(
-    folder: Path, capsys: pytest.CaptureFixture[str], more: list[str], complaint: str
+    folder: Path, capsys: pytest.CaptureFixture[str], more: list[str], message: str
 ) -> None:
     out = folder / "nothing"
     common = ["--start", str(folder / "start.png"), "--state", STATE, "--out", str(out)]
@@ -156,7 +156,7 @@ def test_invalid_input_prints_one_error_and_writes_no_plan(
     assert main(["plan", str(folder / "model"), *common, *goal, *QUICK, *words]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
-    assert complaint in error
+    assert message in error
     assert not (out / "plan.json").exists()
 
 

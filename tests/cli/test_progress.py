@@ -45,13 +45,13 @@ def errors() -> PredictionErrors:
 
 def test_progress_lines_contain_loss_learning_rate_speed_memory_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     output = replace_console(monkeypatch, terminal=False)
-    now = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    clock = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     reporter = TrainingConsole()
     reporter.on_validation(10, Validation(errors(), ranking_of(np.array([0.1, 0.2]), ("a", "b"))))
     reporter.on_start(10, 100)
     for step in (11, 12, 13, 14):
-        now[0] += 4.5
+        clock[0] += 4.5
         reporter.on_step(step, METRICS)
     title, one_step, rollout, ranked, *lines = output.getvalue().splitlines()
     assert title.startswith("validation at step 10, errors relative to persistence")
@@ -115,13 +115,13 @@ def test_training_bar_continues_after_a_validation(monkeypatch: pytest.MonkeyPat
 
 def test_task_with_a_unit_shows_its_speed_until_the_next_task_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     output = replace_console(monkeypatch, terminal=True)
-    now = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    clock = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     with ConsoleReporter() as reporter:
         encoding = reporter.task("encoding frames", "frames")
         assert not output.getvalue(), "a bar appears at its first update"
         encoding(0, 96)
-        now[0] = 4.0
+        clock[0] = 4.0
         encoding(48, 96)
         reporter.task("measuring")(1, 2)
         reporter.note("done")

@@ -191,8 +191,8 @@ BAD_LISTS = {
 }
 
 
-@pytest.mark.parametrize(("content", "complaint"), BAD_LISTS.values(), ids=BAD_LISTS.keys())
-def test_mismatched_range_list_raises(open_with: Any, tmp_path: Path, content: object, complaint: str) -> None:
-    with pytest.raises(InputError, match=complaint) as caught:
+@pytest.mark.parametrize(("content", "message"), BAD_LISTS.values(), ids=BAD_LISTS.keys())
+def test_mismatched_range_list_raises(open_with: Any, tmp_path: Path, content: object, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
         open_with(source_with_rests(), **published(tmp_path, content))
     assert "ranges.json" in caught.value.where

@@ -126,7 +126,7 @@ def test_missing_or_short_recorded_commands_raise(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "complaint"),
+    ("changes", "message"),
     [
         ({"source": "droid_raw"}, "source droid_raw: only for poses"),
         ({"pose_frame": "camera"}, "pose_frame camera: only for poses"),
@@ -141,9 +141,9 @@ def test_missing_or_short_recorded_commands_raise(tmp_path: Path) -> None:
         ({"fields": {"gripper_open": 0.5}}, "data.fields: only for source rlds, and this is source npz"),
     ],
 )
-def test_vector_config_that_needs_poses_or_is_incomplete_raises(changes: dict[str, Any], complaint: str) -> None:
+def test_vector_config_that_needs_poses_or_is_incomplete_raises(changes: dict[str, Any], message: str) -> None:
     values = {"path": "d", "source": "npz", "states": "vector"} | changes
-    with pytest.raises(InputError, match=complaint):
+    with pytest.raises(InputError, match=message):
         parse_config({"run_dir": "r", "model": {"base": "b"}, "data": values}, where="here")
 
 

@@ -41,7 +41,7 @@ def assert_same_decoder(folder: Path, expected: Path) -> None:
 
 
 def test_decoder_memorises_four_frames(make_decoder: MakeConfig, encode_split: EncodeSplit) -> None:
-    config = make_decoder(knobs={"frames": 4, "steps": 80}, data__cache_dtype="fp32")
+    config = make_decoder(options={"frames": 4, "steps": 80}, data__cache_dtype="fp32")
     pairs = encode_split(config, frames=4).read(range(4))
     decoder = load_decoder(train_decoder(config)).decoder
     assert psnr(decoder.decode(pairs.latents), to_images(pairs.images)).min() > 30
@@ -104,7 +104,7 @@ def test_temporary_files_of_a_finished_training_are_removed_but_not_by_check(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"knobs": {"learning_rate": 1e-3}}, r"decoder\.learning_rate: 0\.002, not 0\.001"),
+        ({"options": {"learning_rate": 1e-3}}, r"decoder\.learning_rate: 0\.002, not 0\.001"),
         ({"seed": 1}, "seed: 0, not 1"),
         ({"data__crop": "square"}, "crop"),
         ({"data__test_share": 0.1}, r"data\.test_share: 0\.2, not 0\.1"),

@@ -27,14 +27,14 @@ from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, clips_batch, in_b
 def decoder(*, dim: int = DIM, tokens: int = TOKENS, strength: float = 0.25) -> TrainedDecoder:
     """Return a linear decoder of smooth patches; with strength 0 all images are grey."""
     shape = DecoderShape("linear", dim, round(tokens**0.5), 16)
-    made = Decoder(shape).eval().requires_grad_(False)
+    model = Decoder(shape).eval().requires_grad_(False)
     generator = torch.Generator().manual_seed(3)
     coarse = torch.randn(dim * 3, 1, 4, 4, generator=generator)
     smooth = torch.nn.functional.interpolate(coarse, size=(16, 16), mode="bilinear").reshape(dim, -1)
-    made.linear.weight.copy_(strength * smooth.T)
-    made.linear.bias.zero_()
+    model.linear.weight.copy_(strength * smooth.T)
+    model.linear.bias.zero_()
     card = DecoderCard("vjepa2-ac decoder 1", shape, "an encoder", "released", "fp32", "data", ("camera",), 3, 30, 100)
-    return TrainedDecoder(card, made, Path("decoder"))
+    return TrainedDecoder(card, model, Path("decoder"))
 
 
 def clips(batch: LatentBatch, trained: TrainedDecoder, size: int = 4, noise: float = 0.03) -> RepeatableClips:
@@ -62,8 +62,8 @@ TRAINED = decoder()
 BATCH = clips_batch(24)
 
 
-def measured(*models: object, size: int = 4, **how: object) -> DecodedRollouts:
-    return measure_decoded(evaluated_models(*models), clips(BATCH, TRAINED, size), TRAINED, **how)  # type: ignore[arg-type]
+def measured(*models: object, size: int = 4, **options: object) -> DecodedRollouts:
+    return measure_decoded(evaluated_models(*models), clips(BATCH, TRAINED, size), TRAINED, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

@@ -82,13 +82,15 @@ def test_single_clip_has_no_distribution_and_single_episode_no_mmd() -> None:
 @pytest.mark.parametrize("count", [400, 6])
 def test_frechet_distance_equals_the_matrix_root_formula_for_few_and_many_clips(count: int) -> None:
     rng = np.random.default_rng(0)
-    one, other = rng.standard_normal((count, 8)), 0.5 + 1.5 * rng.standard_normal((count + 1, 8)) * np.arange(1, 9)
-    left, right = (np.cov(values, rowvar=False) for values in (one, other))
-    roots = np.sqrt(np.linalg.eigvals(left @ right).real.clip(min=0))
-    expected = np.square(one.mean(0) - other.mean(0)).sum() + np.trace(left) + np.trace(right) - 2 * roots.sum()
-    assert frechet_distance(one, other) == pytest.approx(expected, rel=1e-6)
-    assert frechet_distance(one, one) == pytest.approx(0, abs=1e-9)
-    assert frechet_distance(one, one + 2) == pytest.approx(8 * 4)
+    first, second = rng.standard_normal((count, 8)), 0.5 + 1.5 * rng.standard_normal((count + 1, 8)) * np.arange(1, 9)
+    first_cov, second_cov = (np.cov(values, rowvar=False) for values in (first, second))
+    roots = np.sqrt(np.linalg.eigvals(first_cov @ second_cov).real.clip(min=0))
+    expected = (
+        np.square(first.mean(0) - second.mean(0)).sum() + np.trace(first_cov) + np.trace(second_cov) - 2 * roots.sum()
+    )
+    assert frechet_distance(first, second) == pytest.approx(expected, rel=1e-6)
+    assert frechet_distance(first, first) == pytest.approx(0, abs=1e-9)
+    assert frechet_distance(first, first + 2) == pytest.approx(8 * 4)
 
 
 # ---- the MMD ----
@@ -154,8 +156,8 @@ def test_mmd_equals_the_sum_over_clip_pairs_from_different_episodes() -> None:
             if ids[i] != ids[j]:
                 count += 1
                 total += sum(
-                    sign * (one[i] @ other[j] / 5) ** 2
-                    for sign, one, other in (
+                    sign * (first[i] @ second[j] / 5) ** 2
+                    for sign, first, second in (
                         (1, predicted, predicted),
                         (1, true, true),
                         (-1, predicted, true),

@@ -1,7 +1,7 @@
 """Errors equal values computed by hand: 0 for an oracle, those of persistence for a model that copies frames."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import product
@@ -56,6 +56,10 @@ def adapter_and_base_errors(evaluation: Evaluation) -> tuple[PredictionErrors, P
     return evaluation.models["adapter"].errors, evaluation.models["base"].errors
 
 
+def values_of(estimates: Iterable[Estimate]) -> list[float]:
+    return [estimate.value for estimate in estimates]
+
+
 @pytest.fixture(scope="module")
 def oracle() -> Evaluation:
     return evaluated(Oracle(), Copier())
@@ -79,10 +83,10 @@ def test_spread_and_mmd_equal_those_of_the_predicted_latents() -> None:
     latents = predicted, batch.latents[:, 1:], batch.latents[:, :1]
     traces = [each.double().var(dim=0, correction=0).sum(dim=(1, 2)) for each in latents]
     models = {name: model.distribution for name, model in evaluation.models.items()}
-    assert [one.value for one in models["adapter"].spread] == pytest.approx((traces[0] / traces[1]).tolist(), rel=1e-5)
-    assert [one.value for one in models["base"].spread] == pytest.approx([1.0] * (TIME - 1))
-    assert [one.value for one in models["base"].mmd] == pytest.approx([0.0] * (TIME - 1), abs=1e-9)
-    assert [one.value for one in evaluation.copies.spread] == pytest.approx((traces[2] / traces[1]).tolist(), rel=1e-5)
+    assert values_of(models["adapter"].spread) == pytest.approx((traces[0] / traces[1]).tolist(), rel=1e-5)
+    assert values_of(models["base"].spread) == pytest.approx([1.0] * (TIME - 1))
+    assert values_of(models["base"].mmd) == pytest.approx([0.0] * (TIME - 1), abs=1e-9)
+    assert values_of(evaluation.copies.spread) == pytest.approx((traces[2] / traces[1]).tolist(), rel=1e-5)
     assert models["base"].fvd == pytest.approx(0.0, abs=1e-6)
     assert models["adapter"].fvd > 0
 
@@ -100,16 +104,16 @@ def test_a_model_that_ignores_actions_has_the_action_ranking_error_of_chance() -
 def test_ratios_and_gains_of_a_model_that_predicts_half_the_motion_equal_manual_computation() -> None:
     evaluation = evaluated(Halfway(), Copier())
     errors, base = adapter_and_base_errors(evaluation)
-    assert [one.value for one in over_persistence(errors, "teacher_forced")] == pytest.approx([0.5] * 4)
-    assert [one.value for one in over_persistence(errors, "rollout", L2)] == pytest.approx([0.25] * 4)
+    assert values_of(over_persistence(errors, "teacher_forced")) == pytest.approx([0.5] * 4)
+    assert values_of(over_persistence(errors, "rollout", L2)) == pytest.approx([0.25] * 4)
     gains = gain_over(errors, base)
-    assert [(one.low, one.value, one.high) for one in gains] == [pytest.approx((0.5, 0.5, 0.5))] * 4
+    assert [(estimate.low, estimate.value, estimate.high) for estimate in gains] == [pytest.approx((0.5, 0.5, 0.5))] * 4
 
 
 def test_errors_with_wrong_actions_equal_direct_predictions(oracle: Evaluation) -> None:
     errors = oracle.models["adapter"].errors
     zero = over_persistence(errors, "teacher_forced", actions="zero")
-    assert [one.value for one in zero] == pytest.approx([1.0] * (TIME - 1), rel=1e-5), "no action, no predicted motion"
+    assert values_of(zero) == pytest.approx([1.0] * (TIME - 1), rel=1e-5), "no action, no predicted motion"
     batch = clips_batch()
     shuffled_actions = batch.actions[[1, *range(11)]]
     expected = (shuffled_actions - batch.actions)[..., :DIM].abs().mean(dim=(0, 2)) * 100

@@ -64,7 +64,7 @@ def true_latents(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
 
 
 def rollouts_by_model_and_actions(comparison: RolloutComparison) -> dict[tuple[str, str], DecodedRollout]:
-    return {(one.model, one.name): one for one in comparison.rollouts}
+    return {(rollout.model, rollout.name): rollout for rollout in comparison.rollouts}
 
 
 def test_all_actions_are_rolled_out_by_base_and_adapter(imagine: Imagine) -> None:
@@ -72,9 +72,9 @@ def test_all_actions_are_rolled_out_by_base_and_adapter(imagine: Imagine) -> Non
     assert list(rollouts_by_model_and_actions(comparison)) == [
         (model, actions) for actions in (AS_RECORDED, "close") for model in ("base", "adapter")
     ]
-    for one in comparison.rollouts:
-        assert one.frames.shape == (STEPS, 32, 32, 3)
-        assert (one.truth is not None) == (one.name == AS_RECORDED)
+    for rollout in comparison.rollouts:
+        assert rollout.frames.shape == (STEPS, 32, 32, 3)
+        assert (rollout.truth is not None) == (rollout.name == AS_RECORDED)
     assert comparison.seconds_per_step == pytest.approx(2 / 15)
     base, adapter = comparison.rollouts[:2]
     assert (base.frames != adapter.frames).any(), "the adapter must change the prediction"
@@ -85,8 +85,8 @@ def test_a_perfect_predictor_shows_decoded_truth_bit_for_bit(
 ) -> None:
     monkeypatch.setattr(WorldModel, "rollout", lambda *_: true_latents[0][:, 1:])
     comparison = imagine(actions=("true", "up"))
-    for one in comparison.rollouts:
-        np.testing.assert_array_equal(one.frames, comparison.decoded_truth)
+    for rollout in comparison.rollouts:
+        np.testing.assert_array_equal(rollout.frames, comparison.decoded_truth)
     assert (comparison.decoded_truth != comparison.decoded_first).any()
 
 
@@ -153,7 +153,7 @@ def test_action_files_are_named_after_the_file(
     np.savetxt(tmp_path / "up.csv", 2 * rows, delimiter=",")
     comparison = imagine(actions=("up", *map(str, files), str(tmp_path / "up.csv")))
     names = ["up", "up.npy", f"{AS_RECORDED}.npy", str(files[2]), "up.csv"]
-    assert [one.name for one in comparison.rollouts if one.model == "adapter"] == names
+    assert [rollout.name for rollout in comparison.rollouts if rollout.model == "adapter"] == names
     for _, actions, states, *_ in rollout_inputs[2:8]:
         np.testing.assert_allclose(actions[0].numpy(), rows[:STEPS], atol=1e-6)
         np.testing.assert_allclose(states[0, :, 2] - states[0, 0, 2], 0.02 * np.arange(STEPS), atol=1e-5)
@@ -170,7 +170,7 @@ def test_model_is_rolled_out_on_the_given_data(
 def test_real_data_have_no_simulated_outcome(whole_run: Path, whole_decoder: Path) -> None:  # noqa: F811
     requested = ImagineOptions(decoder=str(whole_decoder), actions=("up",), steps=2)
     comparison = imagine_clip(str(whole_run), requested, simulate=simulated_outcome)
-    assert (comparison.notes, [one.truth for one in comparison.rollouts]) == ((), [None, None])
+    assert (comparison.notes, [rollout.truth for rollout in comparison.rollouts]) == ((), [None, None])
 
 
 # ---- what is refused -----------------------------------------------------------------------------------------------

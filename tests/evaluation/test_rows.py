@@ -60,10 +60,10 @@ def test_console_page_and_file_show_the_same_rows(tmp_path: Path) -> None:
     write_metrics(EVALUATION, tmp_path / METRICS_FILE)
     written = read_metrics(tmp_path)
     assert [(row.key, row.model) for row in written.rows] == [(row.key, row.model) for row in rows]
-    found = written.of("rollout.l1.over_persistence.3")
-    assert found is not None
-    row = next(row for row in rows if (row.key, row.model) == (found.key, found.model))
-    assert Estimate(found.value or 0, found.low or 0, found.high or 0) == row.estimate
+    stored_row = written.of("rollout.l1.over_persistence.3")
+    assert stored_row is not None
+    row = next(row for row in rows if (row.key, row.model) == (stored_row.key, stored_row.model))
+    assert Estimate(stored_row.value or 0, stored_row.low or 0, stored_row.high or 0) == row.estimate
 
 
 # ---- a third-party metric ----
@@ -79,19 +79,21 @@ def evaluated(trained: object, base: object, *more: Metric) -> Evaluation:
 
 
 def test_a_third_party_metric_appears_in_rows_and_comparison(tmp_path: Path) -> None:
-    found = evaluated(Halfway(), Copier(), LARGER)
-    rows = {(row.key, row.model): row for row in make_rows(found)}
-    ratio, gain = (rows[f"rollout.agreement.{what}.1", "adapter"] for what in ("over_persistence", "gain_over_base"))
+    evaluation_with_metric = evaluated(Halfway(), Copier(), LARGER)
+    rows = {(row.key, row.model): row for row in make_rows(evaluation_with_metric)}
+    ratio, gain = (
+        rows[f"rollout.agreement.{statistic}.1", "adapter"] for statistic in ("over_persistence", "gain_over_base")
+    )
     assert ratio.better == gain.better == "higher"
     assert gain.value > 0
-    for name, each in (("with", found), ("without", evaluated(Halfway(), Copier()))):
+    for name, result in (("with", evaluation_with_metric), ("without", evaluated(Halfway(), Copier()))):
         (tmp_path / name).mkdir()
-        write_metrics(each, tmp_path / name / METRICS_FILE)
-    both = {(row.key, row.model): row for row in compare([tmp_path / "with", tmp_path / "without"]).rows}
-    assert both["rollout.agreement.over_persistence.4", "with"].value > 1
-    assert ("rollout.agreement.over_persistence.4", "without") not in both
+        write_metrics(result, tmp_path / name / METRICS_FILE)
+    compared_rows = {(row.key, row.model): row for row in compare([tmp_path / "with", tmp_path / "without"]).rows}
+    assert compared_rows["rollout.agreement.over_persistence.4", "with"].value > 1
+    assert ("rollout.agreement.over_persistence.4", "without") not in compared_rows
     for run in ("with", "without"):
-        assert both["rollout.l2.over_persistence.4", run].value == pytest.approx(0.25)
+        assert compared_rows["rollout.l2.over_persistence.4", run].value == pytest.approx(0.25)
 
 
 def test_metric_direction_decides_what_is_better() -> None:

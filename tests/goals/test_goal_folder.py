@@ -130,9 +130,9 @@ def test_image_outside_the_folder_raises(folder: Path, tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"goals\.json: goal 2: the file .*Expected a printable path") as caught:
             read_goal_folder(folder)
         assert str(caught.value).isprintable()
-    for file, complaint in (("pipe.png", "a pipe or a device"), ("loop.png", "symbolic links"), (".", "directory")):
+    for file, message in (("pipe.png", "a pipe or a device"), ("loop.png", "symbolic links"), (".", "directory")):
         edit(folder, lambda goals, file=file: goals[1].update(file=file))
-        with pytest.raises(UserError, match=complaint):
+        with pytest.raises(UserError, match=message):
             read_goal_folder(folder)
     edit(folder, lambda goals: goals[1].update(file="inside.png"))
     assert len(read_goal_folder(folder)) == 3

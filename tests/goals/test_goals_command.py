@@ -59,13 +59,13 @@ def test_goals_command_selects_gripper_key_frames(
 
 
 def test_goals_command_accepts_name_or_number_and_selects_every_nth_frame(folder: Path, tmp_path: Path) -> None:
-    _, numbered = goals(folder, tmp_path / "a", "--episode", "1", "--every", "10", "data.stride=5")
-    name = numbered["origin"]["episode"]
-    _, named = goals(folder, tmp_path / "b", "--episode", name, "--every", "10", "data.stride=5")
-    assert named["goals"] == numbered["goals"]
-    assert [goal["frame"] for goal in named["goals"]] == [10, 20, 30, 40]
-    assert [goal["at_most"] for goal in named["goals"]] == [5, 5, 5, None]
-    assert named["origin"]["every"] == 10
+    _, selected_by_number = goals(folder, tmp_path / "a", "--episode", "1", "--every", "10", "data.stride=5")
+    name = selected_by_number["origin"]["episode"]
+    _, selected_by_name = goals(folder, tmp_path / "b", "--episode", name, "--every", "10", "data.stride=5")
+    assert selected_by_name["goals"] == selected_by_number["goals"]
+    assert [goal["frame"] for goal in selected_by_name["goals"]] == [10, 20, 30, 40]
+    assert [goal["at_most"] for goal in selected_by_name["goals"]] == [5, 5, 5, None]
+    assert selected_by_name["origin"]["every"] == 10
 
 
 def test_plan_command_accepts_a_goal_folder(folder: Path, tmp_path: Path) -> None:

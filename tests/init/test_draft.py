@@ -49,17 +49,20 @@ def make(
 def test_batch_size_is_the_largest_that_fits_into_memory(
     gigabytes: int, batch: int, checkpointing: bool, fits: bool
 ) -> None:
-    made = make(machine=replace(MACHINE, gpu_bytes=gigabytes * GB))
-    training = made.config.training
+    proposal = make(machine=replace(MACHINE, gpu_bytes=gigabytes * GB))
+    training = proposal.config.training
     assert (training.batch_size, training.gradient_checkpointing) == (batch, checkpointing)
-    assert ("which fits into" in made.costs[0]) == fits
+    assert ("which fits into" in proposal.costs[0]) == fits
     assert training.batch_size * training.accumulation == 32
 
 
 def test_yaml_text_parses_to_the_drafted_config() -> None:
     for is_scratch in (False, True):
-        made = make(is_scratch=is_scratch)
-        assert parse_config(parse_yaml(made.to_yaml(PROPERTIES, MACHINE), where="here"), where="here") == made.config
+        proposal = make(is_scratch=is_scratch)
+        assert (
+            parse_config(parse_yaml(proposal.to_yaml(PROPERTIES, MACHINE), where="here"), where="here")
+            == proposal.config
+        )
 
 
 BREAKS = ("\n", "\r", "\x85", "\u2028", "\u2029", "\t", "\x07", "\ufffe", " #", ": ", "'", '"', "\\", "`", "- ")
@@ -76,9 +79,9 @@ def test_line_breaks_in_names_cannot_add_config_keys(between: str) -> None:
     assert all(line.startswith("# ") for line in head.splitlines())
     assert parse_yaml(text, where="here") == {"data": values}
     assert not any(line.lstrip().startswith("plugins") for line in text.splitlines()), "a value is on one line"
-    made = make(properties)
-    read = parse_config(parse_yaml(made.to_yaml(properties, MACHINE), where="here"), where="here")
-    assert read == made.config
+    proposal = make(properties)
+    read = parse_config(parse_yaml(proposal.to_yaml(properties, MACHINE), where="here"), where="here")
+    assert read == proposal.config
     assert parse_config(parse_yaml(config_as_yaml(read), where="run"), where="run") == read
 
 
@@ -88,17 +91,17 @@ def test_comment_for_a_single_episode_states_the_exact_number() -> None:
 
 
 def test_batch_size_without_gpu_is_for_an_assumed_gpu() -> None:
-    made = make(machine=replace(MACHINE, gpu=None))
-    assert made.config.training.batch_size == 4
-    assert any("on the training machine" in line for line in made.costs)
+    proposal = make(machine=replace(MACHINE, gpu=None))
+    assert proposal.config.training.batch_size == 4
+    assert any("on the training machine" in line for line in proposal.costs)
 
 
 @pytest.mark.parametrize(("name", "width"), [("vjepa2.1-vitb-384", 768), ("vjepa2-vitl", 1024)])
 def test_new_predictor_has_the_width_of_the_latents(name: str, width: int) -> None:
     model = choose_model(f"checkpoints/{name}.pt", is_scratch=True)
-    made = make_draft(PROPERTIES, MACHINE, model, run_dir="run")
-    assert made.config.model.is_random
-    assert made.config.model.sizes.predictor.width == width
+    proposal = make_draft(PROPERTIES, MACHINE, model, run_dir="run")
+    assert proposal.config.model.is_random
+    assert proposal.config.model.sizes.predictor.width == width
     assert model.bytes_per_frame == 2 * 256 * width
 
 
@@ -116,11 +119,11 @@ def test_precision_and_weight_dtype_follow_from_the_gpu(
     gpu: str | None, has_bf16: bool, precision: str, reason: str, is_scratch: bool, path: str | None
 ) -> None:
     machine = replace(MACHINE, gpu=gpu, has_bf16=has_bf16)
-    made = make_draft(PROPERTIES, machine, choose_model(path, is_scratch), run_dir="runs/mine")
-    training = made.config_values["training"]
+    proposal = make_draft(PROPERTIES, machine, choose_model(path, is_scratch), run_dir="runs/mine")
+    training = proposal.config_values["training"]
     assert isinstance(training, dict)
     dtype = "bfloat16" if precision == "bf16" and path is None else "float32"
-    assert (made.config.training.precision, made.config.model.dtype) == (precision, dtype)
+    assert (proposal.config.training.precision, proposal.config.model.dtype) == (precision, dtype)
     assert training["precision"].reason.startswith(reason)
     assert ("model.dtype" in training["precision"].reason) == (precision == "fp32" and path is None)
 

@@ -97,7 +97,7 @@ def test_values_override_contradicting_column_names_as_a_guess(names: str, rotat
 def test_rotation_vector_with_quaternion_names_and_two_fingers_is_a_guess() -> None:
     fingers = [np.stack([0.04 * (1 - states[:, 6]), -0.04 * (1 - states[:, 6])], axis=1) for states in EPISODES]
     poses = [convert_states(states, "rotation_vector")[:, :6] for states in EPISODES]
-    numbers = [np.concatenate([pose, both], axis=1) for pose, both in zip(poses, fingers, strict=True)]
+    numbers = [np.concatenate([pose, finger_pair], axis=1) for pose, finger_pair in zip(poses, fingers, strict=True)]
     pose = propose_pose("x y z rx ry rz rw gripper", numbers)
     assert (pose["rotation"].value, pose["select"].value) == ("rotation_vector", [0, 1, 2, 3, 4, 5, 6])
     assert pose["state"].is_guess

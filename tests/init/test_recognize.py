@@ -32,8 +32,12 @@ def rename_dataset(folder: Path, name: str) -> Path:
 def make_draft_of(path: Path) -> tuple[dict[str, Any], dict[str, str], str]:
     """Return the section `data`, all guesses and the text of the drafted config for a data set."""
     properties = read_properties(str(path))
-    made = make_draft(properties, LAPTOP, choose_model("builtin:sim-tiny"), run_dir="run")
-    return plain_values(made.config_values)["data"], list_guesses(made.config_values), made.to_yaml(properties, LAPTOP)
+    draft = make_draft(properties, LAPTOP, choose_model("builtin:sim-tiny"), run_dir="run")
+    return (
+        plain_values(draft.config_values)["data"],
+        list_guesses(draft.config_values),
+        draft.to_yaml(properties, LAPTOP),
+    )
 
 
 @pytest.mark.parametrize("form", WRITERS)
@@ -59,10 +63,10 @@ def test_newest_version_is_chosen_and_all_versions_are_listed(tmp_path: Path) ->
     assert (chosen.path, len(chosen.descriptions)) == (str(tmp_path / "my_robot/1.9.0"), 1)
 
 
-@pytest.mark.parametrize(("pick", "place"), [("lerobot", "lerobot"), ("rlds", "lerobot")])
-def test_several_data_sets_in_a_folder_raise_and_are_listed(pick: str, place: str, tmp_path: Path) -> None:
-    WRITERS[pick](tmp_path / "pick" / "1.0.0", range(2))
-    WRITERS[place](tmp_path / "place", range(2))
+@pytest.mark.parametrize(("first", "second"), [("lerobot", "lerobot"), ("rlds", "lerobot")])
+def test_several_data_sets_in_a_folder_raise_and_are_listed(first: str, second: str, tmp_path: Path) -> None:
+    WRITERS[first](tmp_path / "pick" / "1.0.0", range(2))
+    WRITERS[second](tmp_path / "place", range(2))
     with pytest.raises(InputError, match=f"2 data sets: {tmp_path}/pick, {tmp_path}/place.*vjepa2-ac init {tmp_path}"):
         read_properties(str(tmp_path))
 

@@ -103,7 +103,9 @@ def test_small_test_split_proposes_a_share_that_suffices(tmp_path: Path) -> None
     )  # the hashes draw 3 of 38 episodes, although the share is 5.7 episodes
     texts = {}
     for config in (make_data_config(few, **values), with_small_split):
-        (texts[config.path],) = (one.text for one in check_data(config, clips=2) if "cannot show whether" in one.text)
+        (texts[config.path],) = (
+            finding.text for finding in check_data(config, clips=2) if "cannot show whether" in finding.text
+        )
     assert texts[str(few)].endswith("Record more episodes")
     proposed = float(re.search(r"data.test_share=([\d.]+)", texts[str(many)])[1])
     members = open_dataset(with_small_split.model_copy(update={"test_share": proposed})).split_mask("test").sum()

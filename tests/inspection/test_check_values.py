@@ -16,17 +16,17 @@ WITH_TIMES = {"source", "index", "timing"}
 def values_of(batch_size: int, **values: object) -> Values:
     config = DataConfig.model_validate({"validation_share": 0.2, "test_share": 0.2, "workers": 0} | values)
     return {
-        one.about: (one.level, [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", one.text)])
-        for one in check_data(config, batch_size=batch_size)
-        if one.about not in WITH_TIMES
+        finding.about: (finding.level, [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", finding.text)])
+        for finding in check_data(config, batch_size=batch_size)
+        if finding.about not in WITH_TIMES
     }
 
 
-def require(found: Values, pinned: Values) -> None:
+def require(actual: Values, pinned: Values) -> None:
     """Compare levels and numbers; other checks may have been added."""
     for name, (level, numbers) in pinned.items():
-        assert found[name][0] == level, name
-        assert found[name][1] == pytest.approx(numbers, abs=0.011), name
+        assert actual[name][0] == level, name
+        assert actual[name][1] == pytest.approx(numbers, abs=0.011), name
 
 
 def test_values_of_a_moving_spot_equal_the_pinned_values(tmp_path: Path) -> None:

@@ -89,15 +89,15 @@ def test_changes_span_one_stride_within_selected_ranges_in_the_model_frame() -> 
     pairs = [(first, first + 3) for start, end in selected for first in range(start, end - 3)]
     expected = np.array([states[b] - states[a] for a, b in pairs])
     expected[:, 3:6] = [rotation_differences(states[[a, b], 3:6])[0] for a, b in pairs]
-    order = [changes[:, 6].tolist().index(one) for one in expected[:, 6]]
+    order = [changes[:, 6].tolist().index(gripper_change) for gripper_change in expected[:, 6]]
     np.testing.assert_allclose(changes[order], expected, atol=1e-12)
     assert len(changes) == len(pairs)
 
     camera = np.tile(generator.uniform(-1, 1, 6), (20, 1))
-    seen = np.concatenate(list(ReadEpisode(0, states, selected, camera).changes(3, POSE)))
-    np.testing.assert_allclose(seen[:, :3], changes[:, :3] @ matrices_from_euler(camera[0, 3:6]), atol=1e-9)
+    observed_changes = np.concatenate(list(ReadEpisode(0, states, selected, camera).changes(3, POSE)))
+    np.testing.assert_allclose(observed_changes[:, :3], changes[:, :3] @ matrices_from_euler(camera[0, 3:6]), atol=1e-9)
     moved = states_in_camera_frame(states, camera)
-    np.testing.assert_allclose(seen[0, 3:6], rotation_differences(moved[[0, 3], 3:6])[0], atol=1e-9)
+    np.testing.assert_allclose(observed_changes[0, 3:6], rotation_differences(moved[[0, 3], 3:6])[0], atol=1e-9)
 
 
 def test_vectors_whose_numbers_hardly_change_or_only_increase_have_low_diversity() -> None:

@@ -42,9 +42,9 @@ def test_copies_are_found_in_every_data_format_and_from_the_cached_index(source:
         duplicates = find_duplicates(dataset)
         assert (duplicates.is_known, duplicates.episodes, duplicates.different) == (True, 5, 2)
         assert len(duplicates.copies) == 3
-        one, other = (dataset.table.find(name) for name, _ in duplicates.example)
-        assert one != other
-        np.testing.assert_array_equal(*(dataset.source.read(index).states for index in (one, other)))  # type: ignore[arg-type]
+        first, second = (dataset.table.find(name) for name, _ in duplicates.example)
+        assert first != second
+        np.testing.assert_array_equal(*(dataset.source.read(index).states for index in (first, second)))  # type: ignore[arg-type]
 
 
 def test_duplicates_of_a_remote_data_set_without_states_are_skipped(gcs: Gcs, tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_duplicates_of_a_remote_data_set_without_states_are_skipped(gcs: Gcs, tm
     config = config_of("lerobot", "gs://bucket/set", tmp_path)
     duplicates = find_duplicates(open_dataset(config))
     assert duplicates == Duplicates(is_known=False)
-    assert {one.about: one.level for one in check_data(config, clips=2)}["duplicates"] == "skipped"
+    assert {finding.about: finding.level for finding in check_data(config, clips=2)}["duplicates"] == "skipped"
     assert str(duplicates) == "needs the states of the episodes in the index, found none"
 
 
@@ -67,11 +67,11 @@ def test_copies_across_splits_are_counted_with_an_example() -> None:
         across,
         20,
     )
-    (one, first_split), (other, second_split) = duplicates.example
-    assert (splits[one], splits[other]) == (first_split, second_split)
+    (first, first_split), (second, second_split) = duplicates.example
+    assert (splits[first], splits[second]) == (first_split, second_split)
     assert first_split != second_split
-    assert int(one.split()[1]) // 2 == int(other.split()[1]) // 2
-    assert f"{across} of them have a copy in another split, such as {one} ({first_split})" in str(duplicates)
+    assert int(first.split()[1]) // 2 == int(second.split()[1]) // 2
+    assert f"{across} of them have a copy in another split, such as {first} ({first_split})" in str(duplicates)
     assert "data.exclude" in str(duplicates)
     assert "data.split_by" in str(duplicates)
 
@@ -95,9 +95,9 @@ def test_copies_with_noise_or_rounding_are_found_and_similar_episodes_are_not(tm
     folder.mkdir()
     frames = np.random.default_rng(0).integers(0, 255, (STEPS, 8, 8, 3)).astype(np.uint8)
     still = np.tile([0.4, 0, 0.4, 3, 0, 0, 0], (STEPS, 1)) + generator.normal(0, 1e-6, (3, STEPS, 7))
-    states = {f"{number}{how}": one for number in range(3) for how, one in enumerate(near(number))}
-    for name, one in (states | {f"still {number}": one for number, one in enumerate(still)}).items():
-        np.savez(folder / f"{name}.npz", states=one, frames=frames, fps_hz=15.0)
+    states = {f"{number}{variant}": poses for number in range(3) for variant, poses in enumerate(near(number))}
+    for name, poses in (states | {f"still {number}": poses for number, poses in enumerate(still)}).items():
+        np.savez(folder / f"{name}.npz", states=poses, frames=frames, fps_hz=15.0)
     duplicates = find_duplicates(open_dataset(config_of("npz", folder, tmp_path)))
     assert (duplicates.episodes, duplicates.different, duplicates.copies) == (
         9,
@@ -108,11 +108,11 @@ def test_copies_with_noise_or_rounding_are_found_and_similar_episodes_are_not(tm
 
 def test_check_and_inspect_warn_only_if_there_are_copies(tmp_path: Path) -> None:
     copied = config_of("npz", write_npz(tmp_path / "copied", RECORDINGS), tmp_path)
-    finding = next(one for one in check_data(copied, clips=2) if one.about == "duplicates")
+    finding = next(entry for entry in check_data(copied, clips=2) if entry.about == "duplicates")
     assert (finding.level, "5 episodes have the states" in finding.text) == ("warning", True)
     inspection = inspect_dataset(open_dataset(copied))
     assert "inspect.json" in inspection.summary["duplicates"]
     assert sorted(inspection.values["duplicates"]["copies"]) == ["004", "007", "009"]
     single = config_of("npz", write_npz(tmp_path / "single", range(10)), tmp_path)
-    finding = next(one for one in check_data(single, clips=2) if one.about == "duplicates")
+    finding = next(entry for entry in check_data(single, clips=2) if entry.about == "duplicates")
     assert (finding.level, finding.text) == ("ok", "no two episodes have the same states")

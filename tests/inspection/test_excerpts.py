@@ -85,7 +85,7 @@ def test_matching_frames_and_states_have_only_ok_findings(seed: int, space: Stat
 
 
 @pytest.mark.parametrize(
-    ("how", "level", "about", "words"),
+    ("fault", "level", "about", "words"),
     [
         ("late", "error", "agreement", "frames are 8 steps late (0.53 s)"),
         ("early", "warning", "agreement", "frames are 2 steps early (0.13 s)"),
@@ -101,15 +101,15 @@ def test_matching_frames_and_states_have_only_ok_findings(seed: int, space: Stat
         ("one frame", "error", "repeated", "100 % of the frames repeat the previous frame"),
     ],
 )
-def test_each_fault_gives_exactly_one_finding_with_its_cause(how: str, level: str, about: str, words: str) -> None:
-    (finding,) = warnings_in(FAULTS[how](recorded()))
+def test_each_fault_gives_exactly_one_finding_with_its_cause(fault: str, level: str, about: str, words: str) -> None:
+    (finding,) = warnings_in(FAULTS[fault](recorded()))
     assert (finding.level, finding.about, words in finding.text) == (level, about, True), finding
 
 
-@pytest.mark.parametrize("how", ["unchanged", "foreign", "reversed"])
-def test_agreement_of_few_short_or_still_episodes_is_skipped(how: str) -> None:
+@pytest.mark.parametrize("fault", ["unchanged", "foreign", "reversed"])
+def test_agreement_of_few_short_or_still_episodes_is_skipped(fault: str) -> None:
     for pairs in (recorded(episodes=5), recorded(steps=5), [(s[:1].repeat(STEPS, 0), f) for s, f in recorded()]):
-        findings = found_in(FAULTS[how](pairs))
+        findings = found_in(FAULTS[fault](pairs))
         assert [finding.level for finding in findings if finding.about == "agreement"] == ["skipped"]
         assert "needs at least 8 moving episodes of 8 or more steps" in findings[-1].text
     (finding,) = found_in([(s[:1], f[:1]) for s, f in recorded()])
@@ -141,9 +141,9 @@ def test_excerpt_is_the_middle_of_the_longest_selected_range() -> None:
     dataset = in_memory([300] * 4 + [20], exclude=())
     ranges = StepSelection(*(np.array(column, np.int32) for column in ([4, 4], [0, 8], [5, 20])))
     dataset = Dataset(dataset.config, dataset.source, dataset.table, ranges, dataset.broken)
-    (found,) = read_excerpts(dataset, steps=6)
-    assert found.name == "episode 4"
-    np.testing.assert_array_equal(found.states, dataset.source.read(4).states[11:17])
+    (excerpt,) = read_excerpts(dataset, steps=6)
+    assert excerpt.name == "episode 4"
+    np.testing.assert_array_equal(excerpt.states, dataset.source.read(4).states[11:17])
     source = dataset.source
     assert isinstance(source, MemorySource)
     assert source.decoded == [(4, step) for step in range(11, 17)]

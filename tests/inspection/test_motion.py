@@ -64,9 +64,9 @@ def with_black_first_frame(number: int) -> Pair:
 
 
 def joined(number: int) -> Pair:
-    (first, one), (second, other) = clean(number), clean(100 + number)
-    second[:, 0] += 0.4
-    return np.concatenate([first, second]), np.concatenate([one, other])
+    (first_states, first_frames), (second_states, second_frames) = clean(number), clean(100 + number)
+    second_states[:, 0] += 0.4
+    return np.concatenate([first_states, second_states]), np.concatenate([first_frames, second_frames])
 
 
 def with_frozen_camera(number: int) -> Pair:
@@ -103,20 +103,22 @@ def config_of(
 
 
 def findings_of(config: DataConfig) -> dict[str, Finding]:
-    return {one.about: one for one in check_motion(open_dataset(config))}
+    return {finding.about: finding for finding in check_motion(open_dataset(config))}
 
 
 def read_warnings(config: DataConfig) -> dict[str, str]:
-    return {name: one.text for name, one in findings_of(config).items() if one.level in {"warning", "error"}}
+    return {
+        name: finding.text for name, finding in findings_of(config).items() if finding.level in {"warning", "error"}
+    }
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 10.0])
 @pytest.mark.parametrize("make", [clean, near_the_base, with_idle_ends])
 def test_clean_motion_has_no_warning_at_any_rate(tmp_path: Path, make: Callable[[int], Pair], rate_hz: float) -> None:
     findings = findings_of(config_of(tmp_path / "set", make, rate_hz=rate_hz))
-    assert {one.level for one in findings.values()} <= {"ok", "skipped"}
+    assert {finding.level for finding in findings.values()} <= {"ok", "skipped"}
     assert findings["speed"].text.endswith("between control steps (6 of 6 episodes checked)")
-    assert [name for name, one in findings.items() if one.level == "skipped"] == (
+    assert [name for name, finding in findings.items() if finding.level == "skipped"] == (
         ["scale", *(["rotation format"] if make is near_the_base else [])]
     )
 
@@ -163,7 +165,10 @@ def test_single_impossible_position_in_one_episode_is_reported(
     monkeypatch.setattr(motion, "_EPISODES", in_sample)
     config = config_of(tmp_path / "set", with_one_outlier)
     assert (open_dataset(config).table.find("004") in select_sample(open_dataset(config), in_sample)) == (in_sample > 1)
-    for text in (read_warnings(config)["speed"], *(one.text for one in warnings_from_index(open_dataset(config)))):
+    for text in (
+        read_warnings(config)["speed"],
+        *(item.text for item in warnings_from_index(open_dataset(config))),
+    ):
         assert ": 2 control steps in 1 episode (" in text
         assert "Example: 004, step " in text
         assert re.search(r"step (6 to 7|7 to 8): \d\d\.\d m/s", text)
@@ -227,7 +232,7 @@ def test_checks_that_need_poses_or_frames_are_skipped_for_vectors_and_latent_cac
     values = {"source": "npz", "path": str(write_vectors(tmp_path / "set", width=7)), "states": "vector"}
     config = DataConfig.model_validate(values | {"frames": 3, "stride": 2, "workers": 0})
     findings = findings_of(config)
-    assert [one.level for one in findings.values()] == ["skipped"] * 4 + ["ok"] * 2
+    assert [finding.level for finding in findings.values()] == ["skipped"] * 4 + ["ok"] * 2
     assert findings["speed"].text == "needs poses (data.states: pose), found vectors"
 
 

@@ -88,9 +88,9 @@ class StepOracle:
         """Look up the latents: the colours of a frame are the indices of its episode and its step."""
         assert batch.frames is not None
         self.encoded += 1
-        seen = batch.frames[:, :, 0, self._column][..., self._channels].numpy().astype(int)
-        found = [[self._at(episode, step) for episode, step, _ in clip] for clip in seen]
-        latents = torch.from_numpy(np.array(found)).float()[:, :, None]
+        pixels = batch.frames[:, :, 0, self._column][..., self._channels].numpy().astype(int)
+        encoded_steps = [[self._at(episode, step) for episode, step, _ in clip] for clip in pixels]
+        latents = torch.from_numpy(np.array(encoded_steps)).float()[:, :, None]
         return LatentBatch(latents, batch.states, batch.actions, None, batch.episode_ids, batch.starts)
 
     def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
@@ -113,8 +113,8 @@ def dataset_of(fault: Fault, *, episodes: int = EPISODES, steps: int = STEPS, **
     config = DataConfig.model_validate(values | changes)
     source = TwoSided([steps] * episodes, states=lambda number: fault(truth(number, steps)))
     table = source.infos()
-    kept = StepSelection.all_steps(table, np.ones(episodes, bool))
-    return Dataset(config, source, table, kept, BrokenEpisodes(config, episodes))
+    selection = StepSelection.all_steps(table, np.ones(episodes, bool))
+    return Dataset(config, source, table, selection, BrokenEpisodes(config, episodes))
 
 
 def probed(dataset: Dataset, model: StepOracle | Copier | None = None) -> VariantProbe:
@@ -154,31 +154,31 @@ def test_correct_data_have_no_better_variant_and_only_changed_frames_are_encoded
     probe = probed(dataset_of(at(0)), oracle)
     assert probe.better is None
     assert probe.plain.ratio.value < 0.02
-    assert min(one.difference.value for one in probe.results) > 0.1
+    assert min(result.difference.value for result in probe.results) > 0.1
     assert probe.verdict().endswith("on 16 clips from 8 episodes; no variant is significantly better")
     assert probe.is_decided
     assert oracle.encoded == 2 * 3  # two batches; again with red and blue exchanged, and mirrored
-    assert {one.name for one in probe.results} >= {*FAULTS, "red and blue exchanged"}
+    assert {result.name for result in probe.results} >= {*FAULTS, "red and blue exchanged"}
 
 
 def test_probe_of_few_episodes_is_undecided() -> None:
     probe = probed(dataset_of(FAULTS["states reversed"], episodes=4))
-    assert min(one.difference.value for one in probe.results) < -0.1
+    assert min(result.difference.value for result in probe.results) < -0.1
     assert probe.better is None
     assert probe.verdict().startswith("needs at least 5 episodes, found 4 (")
     assert not probe.is_decided
 
 
 def test_variant_worse_than_persistence_is_not_better() -> None:
-    def found(ratio: Estimate) -> VariantResult | None:
+    def find_better_variant(ratio: Estimate) -> VariantResult | None:
         difference = Estimate(-0.2, -0.25, -0.15)
         plain = VariantResult(UNCHANGED, Estimate(1.3, 1.2, 1.4), 0.4, 0.3, clips=64, episodes=12)
         other = replace(plain, name="y negated", ratio=ratio, difference=difference)
         return VariantProbe(plain, (other,)).better
 
-    assert found(Estimate(1.1, 1.05, 1.15)) is None
-    assert found(Estimate(0.95, 0.85, 1.05)) is None
-    assert found(Estimate(0.9, 0.85, 0.95)) is not None
+    assert find_better_variant(Estimate(1.1, 1.05, 1.15)) is None
+    assert find_better_variant(Estimate(0.95, 0.85, 1.05)) is None
+    assert find_better_variant(Estimate(0.9, 0.85, 0.95)) is not None
 
 
 def test_probe_with_a_model_not_better_than_persistence_is_undecided() -> None:
@@ -192,26 +192,26 @@ def test_probe_with_a_model_not_better_than_persistence_is_undecided() -> None:
 def test_shifts_are_limited_by_the_states_on_both_sides_of_a_clip(steps: int, widest: int) -> None:
     dataset = dataset_of(at(0), steps=steps)
     oracle = StepOracle(steps)
-    asked: list[tuple[int, int]] = []
+    encoded_starts: list[tuple[int, int]] = []
 
     def encode(batch: Batch) -> LatentBatch:
-        asked.extend(
+        encoded_starts.extend(
             (dataset.table.find(name) or 0, start) for name, start in zip(batch.episode_ids, batch.starts, strict=True)
         )
         return oracle.encode(batch)
 
     probe = probe_variants(oracle, encode, dataset, ClipSample("train", 16))
-    results = {one.name for one in probe.results}
+    results = {result.name for result in probe.results}
     for shift in (1, 2, 4, 8):
         assert (f"frames {shift} step{'s' * (shift > 1)} late" in results) == (shift <= widest)
-    assert asked
-    assert all(widest <= start <= steps - 9 - widest for _, start in asked)
+    assert encoded_starts
+    assert all(widest <= start <= steps - 9 - widest for _, start in encoded_starts)
     assert probe.better is None
 
 
 def test_variants_depend_on_the_state_and_on_available_frames() -> None:
     def names(**changes: object) -> set[str]:
-        return {one.name for one in make_variants(DataConfig.model_validate({"path": "set"} | changes), [1])}
+        return {variant.name for variant in make_variants(DataConfig.model_validate({"path": "set"} | changes), [1])}
 
     shifted = {"frames 1 step late", "frames 1 step early"}
     colours = {"red and blue exchanged", "frames mirrored"}
@@ -234,8 +234,8 @@ def test_persistence_is_measured_on_the_changed_frames() -> None:
 
     dataset = dataset_of(at(0))
     probe = probe_variants(Copier(), encode, dataset, ClipSample("train", 16))
-    (mirrored_ones,) = [one for one in probe.results if one.name == "frames mirrored"]
-    assert mirrored_ones.ratio.value == pytest.approx(1)
+    (mirrored_result,) = [result for result in probe.results if result.name == "frames mirrored"]
+    assert mirrored_result.ratio.value == pytest.approx(1)
     assert probe.better is None
 
 
@@ -243,12 +243,12 @@ def test_persistence_is_measured_on_the_changed_frames() -> None:
 def test_mirroring_twice_restores_poses_and_rotations_stay_proper(axis: int) -> None:
     generator = np.random.default_rng(axis)
     states = generator.uniform(-1, 1, (50, 7)) * [1, 1, 1, np.pi, 1.5, np.pi, 1]
-    seen = mirror_poses(states, axis)
-    np.testing.assert_allclose(np.linalg.det(matrices_from_euler(seen[:, 3:6])), 1)
-    np.testing.assert_allclose(mirror_poses(seen, axis), states, atol=1e-9)
-    np.testing.assert_allclose(seen[:, axis], -states[:, axis])
-    np.testing.assert_allclose(np.delete(seen, [axis, 3, 4, 5], axis=1), np.delete(states, [axis, 3, 4, 5], axis=1))
-    actions, of_seen = actions_from_states(states), actions_from_states(seen)
-    np.testing.assert_allclose(mirror_poses(actions, axis), of_seen, atol=1e-9)  # so do its actions
-    pointing, of_mirror = (matrices_from_euler(one[:, 3:6])[:, :, 2] for one in (states, seen))
-    np.testing.assert_allclose(of_mirror, pointing * np.where(np.arange(3) == axis, -1, 1), atol=1e-9)
+    mirrored = mirror_poses(states, axis)
+    np.testing.assert_allclose(np.linalg.det(matrices_from_euler(mirrored[:, 3:6])), 1)
+    np.testing.assert_allclose(mirror_poses(mirrored, axis), states, atol=1e-9)
+    np.testing.assert_allclose(mirrored[:, axis], -states[:, axis])
+    np.testing.assert_allclose(np.delete(mirrored, [axis, 3, 4, 5], axis=1), np.delete(states, [axis, 3, 4, 5], axis=1))
+    actions, mirrored_actions = actions_from_states(states), actions_from_states(mirrored)
+    np.testing.assert_allclose(mirror_poses(actions, axis), mirrored_actions, atol=1e-9)  # so do its actions
+    pointing, mirrored_pointing = (matrices_from_euler(poses[:, 3:6])[:, :, 2] for poses in (states, mirrored))
+    np.testing.assert_allclose(mirrored_pointing, pointing * np.where(np.arange(3) == axis, -1, 1), atol=1e-9)

@@ -33,7 +33,7 @@ def probed(config: Config, model: str, clips: int = 4) -> VariantProbe:
 
 
 def names(probe: VariantProbe) -> set[str]:
-    return {one.name for one in probe.results}
+    return {result.name for result in probe.results}
 
 
 def test_probe_prints_a_table_and_a_verdict_after_the_findings(
@@ -75,8 +75,8 @@ def test_latent_cache_is_probed_with_its_encoder_and_without_frame_variants(
     probe, expected = probed(config, base), probed(of_frames, base)
     assert probe.plain.ratio.value == pytest.approx(expected.plain.ratio.value, rel=2e-3)  # kept in bfloat16
     assert names(probe) == names(expected) - {"red and blue exchanged", "frames mirrored"}
-    differences = {one.name: one.difference.value for one in expected.results}
-    for one in probe.results:
-        assert one.difference.value == pytest.approx(differences[one.name], rel=0.02, abs=0.02)
+    differences = {result.name: result.difference.value for result in expected.results}
+    for result in probe.results:
+        assert result.difference.value == pytest.approx(differences[result.name], rel=0.02, abs=0.02)
     assert check(config, tmp_path, "builtin:sim-tiny") == 2
     assert "encoder" in capsys.readouterr().err

@@ -34,8 +34,8 @@ def dataset_of(source: MemorySource, **changes: object) -> Dataset:
     values = {"path": "tracks", "frames": 4, "stride": 1, "validation_share": 0.9, "test_share": 0.0, "workers": 0}
     config = DataConfig.model_validate(values | changes)
     table = source.infos()
-    kept = StepSelection.all_steps(table, np.ones(len(table), bool))
-    return Dataset(config, source, table, kept, BrokenEpisodes(config, len(table)))
+    selection = StepSelection.all_steps(table, np.ones(len(table), bool))
+    return Dataset(config, source, table, selection, BrokenEpisodes(config, len(table)))
 
 
 def encode(batch: Batch) -> LatentBatch:
@@ -83,10 +83,10 @@ def test_calibration_recovers_the_stride_of_the_training(learned: int) -> None:
 def test_ratios_equal_values_computed_by_hand() -> None:
     calibration = calibrated(ConstantVelocity(8), tracks([80] * 5), clips=10)
     assert list(calibration.results) == [4, 8, 15]
-    assert [one.ratio.value for one in calibration.results.values()] == [
+    assert [result.ratio.value for result in calibration.results.values()] == [
         pytest.approx(4 / 4, abs=1e-3), pytest.approx(0.0, abs=1e-3), pytest.approx(7 / 15, abs=1e-3),
     ]  # fmt: skip
-    assert [one["stride"] for one in calibration.as_dict()["strides"]] == [4, 8, 15]
+    assert [result["stride"] for result in calibration.as_dict()["strides"]] == [4, 8, 15]
     assert calibration.best.difference is not None
     assert calibration.best.difference.value == pytest.approx(-7 / 15, abs=1e-3)
 
@@ -108,7 +108,7 @@ def test_all_strides_are_measured_at_the_same_starts() -> None:
 
 def test_persistence_model_has_no_significant_best_stride() -> None:
     calibration = calibrated(ConstantVelocity(0), tracks([80] * 6, noise=0.2))
-    assert [one.ratio.value for one in calibration.results.values()] == [1.0, 1.0, 1.0]
+    assert [result.ratio.value for result in calibration.results.values()] == [1.0, 1.0, 1.0]
     assert not calibration.is_certain
     assert "uncertain" in calibration.verdict()
     assert "The model is not better than persistence at any stride" in calibration.verdict()
@@ -142,7 +142,7 @@ def test_unreadable_clips_are_skipped_and_an_error_if_no_clip_is_readable(monkey
     source.unreadable = frozenset({int(dataset.windows("validation").episodes[0])})
     calibration = calibrate(ConstantVelocity(8), encode, dataset, ClipSample(clips=200, batch_size=1))
     assert calibration.best.episodes == len(dataset.windows("validation").episodes) - 1
-    assert len({one.clips for one in calibration.results.values()}) == 1
+    assert len({result.clips for result in calibration.results.values()}) == 1
     source.unreadable = frozenset(range(20))
     with pytest.raises(InputError, match="none of the clips can be read; broken episodes: track"):
         calibrate(ConstantVelocity(8), encode, dataset, ClipSample(batch_size=4))

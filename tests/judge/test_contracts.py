@@ -12,18 +12,22 @@ from installing import install
 from paths import ROOT
 from served import STATE, image, make_controller
 
-HERE = Path(__file__).parent
+FOLDER = Path(__file__).parent
 EXAMPLES = ROOT / "examples/judge"
 
 
 def run_script(python: str | Path, script: str, folder: Path, **environment: str) -> dict:
     """Run a script of this folder, which writes found.json into a folder."""
-    done = subprocess.run(
-        [python, HERE / script, folder], capture_output=True, text=True, env={**os.environ, **environment}, timeout=120
+    process = subprocess.run(
+        [python, FOLDER / script, folder],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environment},
+        timeout=120,
     )
-    assert done.returncode == 0, done.stderr
-    found: dict = json.loads((folder / "found.json").read_text())
-    return found
+    assert process.returncode == 0, process.stderr
+    results: dict = json.loads((folder / "found.json").read_text())
+    return results
 
 
 def test_stable_worldmodel_solver_plans_with_this_model(tmp_path: Path) -> None:
@@ -37,8 +41,8 @@ def test_stable_worldmodel_solver_plans_with_this_model(tmp_path: Path) -> None:
     chunks = np.random.default_rng(0).normal(0, 0.02, (5, 2, 7))
     np.savez(tmp_path / "given.npz", image=image(0), goal=image(100), state=STATE, chunks=chunks)
     paths = os.pathsep.join([str(tmp_path / "site"), str(EXAMPLES), str(ROOT / "tests/support"), str(ROOT / "src")])
-    found = run_script(sys.executable, "in_stable_worldmodel.py", tmp_path, PYTHONPATH=paths)
-    np.testing.assert_allclose(found["costs"][1], own.score(image(0), STATE, chunks).energies, rtol=1e-5)
-    assert found["shape"] == [2, 5]
-    assert found["is_costable"]
-    assert found["solved"] < found["nothing"]
+    results = run_script(sys.executable, "in_stable_worldmodel.py", tmp_path, PYTHONPATH=paths)
+    np.testing.assert_allclose(results["costs"][1], own.score(image(0), STATE, chunks).energies, rtol=1e-5)
+    assert results["shape"] == [2, 5]
+    assert results["is_costable"]
+    assert results["solved"] < results["nothing"]

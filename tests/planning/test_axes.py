@@ -96,17 +96,17 @@ def test_limits_apply_to_executed_actions_with_calibrated_axes(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("changes", "complaint"),
+    ("changes", "message"),
     [
         ({"problem": "uncertain: yaw 30 degrees"}, "uncertain: yaw 30 degrees"),
         ({"format": 7}, r"format: .*\(found 7\)"),
         ({"yaw_degrees": {"value": "north", "low": None, "high": None}}, r"yaw_degrees\.value"),
     ],
 )
-def test_unusable_axes_file_raises(tmp_path: Path, changes: dict, complaint: str) -> None:
+def test_unusable_axes_file_raises(tmp_path: Path, changes: dict, message: str) -> None:
     model = tiny_model()
     path = write_axes(tmp_path / "axes.json", model, **changes)
-    with pytest.raises(InputError, match=f"(?s)planning.axes.*{complaint}"):
+    with pytest.raises(InputError, match=f"(?s)planning.axes.*{message}"):
         make_controller(model, axes=path)
 
 

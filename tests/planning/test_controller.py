@@ -47,7 +47,7 @@ def test_bfloat16_model_can_plan(planner: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("frame", "complaint"),
+    ("frame", "message"),
     [
         (image(0, 48, 60), "like the goal image"), (image(0, 60, 60), "like the goal image"),
         (image(0, 50, 48), "like the goal image"), (image(0)[..., 0], "RGB image"),
@@ -55,12 +55,12 @@ def test_bfloat16_model_can_plan(planner: str) -> None:
         (image(0).astype(np.float32), "RGB image"), (image(0)[:4, :4], "RGB image"),
     ],
 )  # fmt: skip
-def test_invalid_image_raises(frame: np.ndarray, complaint: str) -> None:
+def test_invalid_image_raises(frame: np.ndarray, message: str) -> None:
     controller = make_controller()
     controller.reset(image(100))
-    with pytest.raises(InputError, match=complaint):
+    with pytest.raises(InputError, match=message):
         controller.act(frame, STATE)
-    with pytest.raises(InputError, match=r"goal 1.*" + complaint):
+    with pytest.raises(InputError, match=r"goal 1.*" + message):
         controller.reset(image(100), frame, durations=(1,))
 
 
@@ -106,7 +106,7 @@ def test_warm_start_is_the_last_plan_shifted_by_one_step(monkeypatch: pytest.Mon
     controller = make_controller(warm_start=True, horizon=3)
     actions(controller, 1)
     before, starts, plan = controller.decision.plan, [], controller.planner.plan
-    monkeypatch.setattr(controller.planner, "plan", lambda *given: (starts.append(given[2]), plan(*given))[1])
+    monkeypatch.setattr(controller.planner, "plan", lambda *args: (starts.append(args[2]), plan(*args))[1])
     controller.act(image(1), STATE)
     assert torch.equal(starts[0].mean, before.mean[[1, 2, 2]])
     assert not torch.equal(before.mean[0], before.mean[1])
@@ -123,8 +123,8 @@ def test_mask_is_cropped_like_the_image_and_weights_patches() -> None:
     mask[:16, 72:] = True
     controller.reset(image(100, 48, 120), mask=mask)
     assert controller._patch_weights.nonzero().flatten().tolist() == [2]
-    for wrong, complaint in ((np.zeros((48, 120), bool), "no pixel inside the cropped image"), (mask.T, "mask")):
-        with pytest.raises(InputError, match=complaint):
+    for wrong, message in ((np.zeros((48, 120), bool), "no pixel inside the cropped image"), (mask.T, "mask")):
+        with pytest.raises(InputError, match=message):
             controller.reset(image(100, 48, 120), mask=wrong)
 
 

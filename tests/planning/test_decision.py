@@ -52,7 +52,9 @@ def test_plan_file_contains_the_decision(tmp_path: Path) -> None:
         "now": result.decision.current_energy, "began": result.decision.progress.initial_energy,
         "doing_nothing": result.zero_action_energy, "plan": plan.energy,
     }  # fmt: skip
-    assert [one["lowest"] for one in file["iterations"]] == [one.lowest for one in plan.iterations]
+    assert [iteration["lowest"] for iteration in file["iterations"]] == [
+        iteration.lowest for iteration in plan.iterations
+    ]
     np.testing.assert_allclose(file["iterations"][2]["std"], plan.iterations[2].std)
     assert PlanningConfig.model_validate_json(json.dumps(file["settings"])) == QUICK
     assert file["evaluations"] == plan.evaluations

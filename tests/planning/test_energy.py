@@ -48,7 +48,7 @@ def test_rollout_equals_a_plain_implementation(adapted: bool, extrinsics: bool) 
     )
     with torch.no_grad():
         actual, states = WorldModelCost(model, start, goal(), EnergyConfig()).rollout(samples)
-    expected = torch.stack([plain_predictions(model, start, one) for one in samples])
+    expected = torch.stack([plain_predictions(model, start, sample) for sample in samples])
     torch.testing.assert_close(actual, expected, rtol=2e-5, atol=2e-5)
     assert states.shape == (3, 4, 7)
     assert (actual[0] - actual[1]).abs().mean() > 1e-3  # the predictions depend on the actions
@@ -64,8 +64,8 @@ def test_target_model_receives_states_integrated_from_changes(joined: str) -> No
     actual, states = WorldModelCost(model, start, goal(), EnergyConfig(), spaces=spaces).rollout(samples)
     after = start.state + torch.cat([torch.zeros(2, 1, 3), samples.cumsum(dim=1)], dim=1)
     torch.testing.assert_close(states, after)
-    given = after[:, 1:] if joined == "last" else samples
-    torch.testing.assert_close(actual, model.rollout(start.latents.expand(2, 1, -1, -1), given, after[:, :-1]))
+    model_actions = after[:, 1:] if joined == "last" else samples
+    torch.testing.assert_close(actual, model.rollout(start.latents.expand(2, 1, -1, -1), model_actions, after[:, :-1]))
 
 
 @torch.no_grad()
@@ -78,18 +78,18 @@ def test_energies_are_independent_of_the_batch_size() -> None:
 
 
 def test_predictor_batches_are_at_most_samples_at_once() -> None:
-    model, seen = tiny_model(), []
-    model.base_predictor.register_forward_pre_hook(lambda _, given: seen.append(len(given[0])))
+    model, batch_sizes = tiny_model(), []
+    model.base_predictor.register_forward_pre_hook(lambda _, inputs: batch_sizes.append(len(inputs[0])))
     with torch.no_grad():
         cost(model, samples_at_once=3)(actions(7, 1))
-    assert seen == [3, 3, 1]
-    seen.clear()
+    assert batch_sizes == [3, 3, 1]
+    batch_sizes.clear()
     samples = actions(7, 1).requires_grad_()
     cost(model, samples_at_once=7)(samples).sum().backward()  # a single batch is not recomputed
-    assert seen == [7]
-    seen.clear()
+    assert batch_sizes == [7]
+    batch_sizes.clear()
     cost(model, samples_at_once=4)(samples).sum().backward()  # several batches are recomputed one at a time
-    assert sorted(seen) == [3, 3, 4, 4]
+    assert sorted(batch_sizes) == [3, 3, 4, 4]
 
 
 def test_distances_equal_their_formulas() -> None:
@@ -119,7 +119,9 @@ def test_energy_goal_depends_on_the_elapsed_steps() -> None:
     energies = [
         WorldModelCost(model, scene(), target, EnergyConfig(), elapsed_steps=steps)(samples) for steps in (0, 3, 4)
     ]
-    single = [WorldModelCost(model, scene(), Goal(one[None]), EnergyConfig())(samples) for one in target.latents]
+    single = [
+        WorldModelCost(model, scene(), Goal(latents[None]), EnergyConfig())(samples) for latents in target.latents
+    ]
     for actual, expected in zip(energies, (single[0], single[0], single[1]), strict=True):
         torch.testing.assert_close(actual, expected)
 
@@ -225,11 +227,11 @@ class OperationRecorder(TorchDispatchMode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.seen: set[str] = set()
+        self.operations: set[str] = set()
 
-    def __torch_dispatch__(self, operation: Any, types: Any, given: Any = (), named: Any = None) -> Any:
-        self.seen.add(operation._overloadpacket.__name__)
-        return operation(*given, **(named or {}))
+    def __torch_dispatch__(self, operation: Any, types: Any, arguments: Any = (), options: Any = None) -> Any:
+        self.operations.add(operation._overloadpacket.__name__)
+        return operation(*arguments, **(options or {}))
 
 
 def record_operations(work: Callable[[], object]) -> set[str]:
@@ -237,7 +239,7 @@ def record_operations(work: Callable[[], object]) -> set[str]:
     work()
     with OperationRecorder() as recorder:
         work()
-    return recorder.seen
+    return recorder.operations
 
 
 @torch.no_grad()
@@ -246,7 +248,7 @@ def test_energies_are_computed_without_device_synchronisation(steps: str, kind: 
     measure, samples = cost(tiny_model(), samples_at_once=4, steps=steps, distance=kind), actions(10, 3)
     reported: list[tuple[int, int]] = []
     measure.progress = lambda *progress: reported.append(progress)
-    seen = record_operations(lambda: measure(samples))
+    operations = record_operations(lambda: measure(samples))
     assert reported == 2 * [(4, 10), (8, 10), (10, 10)]
-    assert "addmm" in seen
-    assert not seen & SYNCHRONISING
+    assert "addmm" in operations
+    assert not operations & SYNCHRONISING

@@ -123,7 +123,7 @@ def test_invalid_goals_raise_and_leave_the_controller_unchanged(goals: list[SubG
 
 def test_example_of_the_planning_guide_runs(tmp_path: Path) -> None:
     examples = re.findall(r"```py\n(.*?)```", (ROOT / "docs/planning.md").read_text(), flags=re.DOTALL)
-    (example,) = (one for one in examples if "read_goal_folder" in one)
+    (example,) = (text for text in examples if "read_goal_folder" in text)
     write_goals(tmp_path, [SubGoal(image(100), "grasped", at_most=3), SubGoal(image(101))])
     controller = make_controller()
     exec(  # noqa: S102 - the example is part of the repository
@@ -143,9 +143,9 @@ def test_gripper_mode_without_gripper_or_free_component_raises() -> None:
         held.follow([SubGoal(image(100), gripper="held")])
 
 
-def sub_goal(*given: object, **named: object) -> SubGoal:
+def sub_goal(*arguments: object, **options: object) -> SubGoal:
     """Return a goal with a rule; the image is arbitrary."""
-    return SubGoal(np.zeros(0), *given, **named)
+    return SubGoal(np.zeros(0), *arguments, **options)
 
 
 def progress_over(rules: Sequence[SubGoal], energies: Sequence[Sequence[float]]) -> list[GoalProgress]:
@@ -175,7 +175,7 @@ def goal_sequences(draw: st.DrawFn) -> tuple[list[SubGoal], list[list[float]]]:
 def test_goal_index_never_decreases_and_steps_are_within_bounds(rules_and_energies: tuple) -> None:
     rules, energies = rules_and_energies
     actual = progress_over(rules, energies)
-    goal_indices = [one.goal_index for one in actual]
+    goal_indices = [state.goal_index for state in actual]
     assert all(0 <= after - before <= 1 for before, after in pairwise(goal_indices))
     for index, goal in enumerate(rules[:-1]):
         assert goal.at_least <= goal_indices.count(index) <= goal.at_most
@@ -190,23 +190,23 @@ def test_goal_ends_early_only_below_its_energy_share(rules_and_energies: tuple) 
     rules, energies = rules_and_energies
     actual = progress_over(rules, energies)
     for step, (before, after) in enumerate(pairwise(actual), start=1):
-        goal, now = rules[before.goal_index], energies[step][before.goal_index]
+        goal, energy = rules[before.goal_index], energies[step][before.goal_index]
         if after.goal_index > before.goal_index:
-            share = goal.share is not None and (now < goal.share * before.initial_energy or now <= 1e-6)
+            share = goal.share is not None and (energy < goal.share * before.initial_energy or energy <= 1e-6)
             assert share or step - before.start_step == goal.at_most
             assert after.initial_energy == pytest.approx(energies[step][after.goal_index], nan_ok=True)
         elif not before.is_done and step - before.start_step >= goal.at_least and goal.share is not None:
-            reached = now < goal.share * before.initial_energy or now <= 1e-6
+            reached = energy < goal.share * before.initial_energy or energy <= 1e-6
             assert after.is_done == reached
 
 
 def test_initial_energy_is_measured_when_a_goal_begins() -> None:
     rules = [sub_goal("grasp", 1, 9, 0.5), sub_goal(share=0.5)]
     actual = progress_over(rules, [[1.0, 5.0], [0.6, 4.0], [0.4, 3.0], [9.0, 2.0], [9.0, 1.4], [9.0, 9.0]])
-    assert [one.goal_index for one in actual] == [0, 0, 1, 1, 1, 1]
-    assert [one.start_step for one in actual] == [0, 0, 2, 2, 2, 2]
-    assert [one.initial_energy for one in actual] == [1.0, 1.0, 3.0, 3.0, 3.0, 3.0]
-    assert [one.is_done for one in actual] == [False] * 4 + [True] * 2, "a reached goal stays reached"
+    assert [state.goal_index for state in actual] == [0, 0, 1, 1, 1, 1]
+    assert [state.start_step for state in actual] == [0, 0, 2, 2, 2, 2]
+    assert [state.initial_energy for state in actual] == [1.0, 1.0, 3.0, 3.0, 3.0, 3.0]
+    assert [state.is_done for state in actual] == [False] * 4 + [True] * 2, "a reached goal stays reached"
     assert actual[2].changed == "Goal 1 (grasp), after 2 steps: energy 0.4 is below 50% of 1."
     assert actual[4].changed == "Goal 2, after 2 steps: energy 1.4 is below 50% of 3."
     assert not actual[5].changed
@@ -216,5 +216,5 @@ def test_nan_energy_does_not_advance_the_goal_before_at_most() -> None:
     nan = float("nan")
     rules = [sub_goal("", 1, 3, 0.5), sub_goal(share=0.5)]
     actual = progress_over(rules, [[nan, nan]] * 6)
-    assert [one.goal_index for one in actual] == [0, 0, 0, 1, 1, 1]
+    assert [state.goal_index for state in actual] == [0, 0, 0, 1, 1, 1]
     assert not actual[-1].is_done

@@ -14,13 +14,15 @@ START = np.array([0.4, 0.1, 0.3, np.pi - 0.01, 0.02, -0.7, 0.4])
 ROWS = np.array([[0.05, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0], [0.0, -0.02, 0.01, 0.0, 0.0, 0.0, -0.75]])
 
 
-@pytest.mark.parametrize(("one", "other"), [("up", "down"), ("left", "right"), ("forward", "back"), ("close", "open")])
-def test_opposite_named_actions_sum_to_zero_and_move_along_one_axis(one: str, other: str) -> None:
-    there, back = make_named_actions(one, 3), make_named_actions(other, 3)
-    assert there.any()
-    assert not (there + back).any()
-    ends = [integrate_states(START, actions)[-1] for actions in (there, back)]
-    axis = {"up": 2, "left": 1, "forward": 0, "close": 6}[one]
+@pytest.mark.parametrize(
+    ("name", "opposite_name"), [("up", "down"), ("left", "right"), ("forward", "back"), ("close", "open")]
+)
+def test_opposite_named_actions_sum_to_zero_and_move_along_one_axis(name: str, opposite_name: str) -> None:
+    moves, opposite_moves = make_named_actions(name, 3), make_named_actions(opposite_name, 3)
+    assert moves.any()
+    assert not (moves + opposite_moves).any()
+    ends = [integrate_states(START, actions)[-1] for actions in (moves, opposite_moves)]
+    axis = {"up": 2, "left": 1, "forward": 0, "close": 6}[name]
     assert ends[0][axis] > START[axis] > ends[1][axis]
     same = np.arange(7) != axis
     np.testing.assert_allclose(ends[0][same], START[same], atol=1e-9)

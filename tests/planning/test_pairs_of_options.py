@@ -174,17 +174,17 @@ def test_every_option_is_varied(shared_files: SharedFiles) -> None:
 
 def test_every_pair_of_options_works_or_raises_before_the_first_decision(shared_files: SharedFiles) -> None:
     refused, compatible = set(), {name: set[str]() for name in OTHERS | MORE}
-    for one, other in combinations(OTHERS | MORE, 2):
-        shared = get_entries(one).keys() & get_entries(other).keys()
-        if any(get_entries(one)[key] != get_entries(other)[key] for key in shared):
+    for first, second in combinations(OTHERS | MORE, 2):
+        shared = get_entries(first).keys() & get_entries(second).keys()
+        if any(get_entries(first)[key] != get_entries(second)[key] for key in shared):
             continue  # two values of one option
         try:
-            shared_files.config(one, other)
+            shared_files.config(first, second)
         except InputError:
-            refused.add(frozenset({one, other}))
+            refused.add(frozenset({first, second}))
             continue
-        compatible[one].add(other)
-        compatible[other].add(one)
+        compatible[first].add(second)
+        compatible[second].add(first)
     assert refused == REFUSED
     pairs = [frozenset(pair) for pair in combinations(compatible, 2) if pair[1] in compatible[pair[0]]]
     alone = [sorted(pair) for pair in pairs if pair & ALONE]
@@ -200,8 +200,8 @@ def group_pairs(pairs: list[frozenset[str]], compatible: dict[str, set[str]], at
     while pairs:
         group = sorted(pairs[0])
         names = {name for pair in pairs for name in pair}
-        for name in sorted(names, key=lambda name: (-sum({name, one} in pairs for one in group), name)):
-            if len(group) < at_most and all(name in compatible[one] for one in group):
+        for name in sorted(names, key=lambda name: (-sum({name, member} in pairs for member in group), name)):
+            if len(group) < at_most and all(name in compatible[member] for member in group):
                 group.append(name)
         pairs = [pair for pair in pairs if not pair <= {*group}]
         yield group

@@ -60,8 +60,8 @@ def test_run_plans_with_its_own_config(run: Path) -> None:
 
 def test_named_checkpoint_is_used_for_planning(run: Path, base_folder: Path) -> None:
     newest, best, base = (
-        prediction(load_for_planning(*given[:1], checkpoint=given[1]).world_model)
-        for given in ((str(run), "newest"), (str(run), "selected"), (str(base_folder), "selected"))
+        prediction(load_for_planning(*arguments[:1], checkpoint=arguments[1]).world_model)
+        for arguments in ((str(run), "newest"), (str(run), "selected"), (str(base_folder), "selected"))
     )
     torch.testing.assert_close(prediction(load_for_planning(str(run), checkpoint="10").world_model), best)
     assert not torch.allclose(newest, best, atol=1e-4)
@@ -79,7 +79,7 @@ def test_model_plans_with_and_without_a_config(make_config, base_folder: Path, t
 
 
 @pytest.mark.parametrize(
-    ("given", "complaint"),
+    ("options", "message"),
     [
         ({"overrides": ["training.steps=3"]}, r"training\.steps=3: a setting that planning does not use"),
         ({"overrides": ["horizon=3"]}, r"did you mean planning\.horizon"),
@@ -87,9 +87,9 @@ def test_model_plans_with_and_without_a_config(make_config, base_folder: Path, t
         ({"checkpoint": "best"}, "not the folder of a run"),
     ],
 )
-def test_invalid_planning_settings_raise(base_folder: Path, given: dict, complaint: str) -> None:
-    with pytest.raises(InputError, match=complaint):
-        load_for_planning(str(base_folder), **given)
+def test_invalid_planning_settings_raise(base_folder: Path, options: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        load_for_planning(str(base_folder), **options)
 
 
 VECTORS = {
@@ -105,7 +105,7 @@ def test_vector_run_plans_within_the_motions_of_its_data(make_config, reporter) 
     folder = train(make_config(**VECTORS, training__steps=1), reporter)
     data_changes = json.loads((folder / "changes.json").read_text())["changes"]
     states = [episode.states for episode in episodes_of(folder)]
-    expected = np.percentile(np.abs(np.concatenate([one[2:] - one[:-2] for one in states])), 99, axis=0)
+    expected = np.percentile(np.abs(np.concatenate([values[2:] - values[:-2] for values in states])), 99, axis=0)
     np.testing.assert_allclose(data_changes, expected, rtol=1e-6)
     controller = Controller.of_subject(load_for_planning(str(folder)))
     controller.reset(image(0))
@@ -119,9 +119,9 @@ def test_vector_run_plans_within_the_motions_of_its_data(make_config, reporter) 
     assert np.abs(limited.act(image(1), states[0][0])).max() <= 0.01
     with pytest.raises(InputError, match=r"state: 7 numbers .* Expected 8: state 0, state 1"):
         limited.act(image(1), np.zeros(7))
-    for content, complaint in (('{"changes": [1.0, "far"]}', "one number of 0 or more"), ('{"changes": 3}', "found|3")):
+    for content, message in (('{"changes": [1.0, "far"]}', "one number of 0 or more"), ('{"changes": 3}', "found|3")):
         (folder / "changes.json").write_text(content)
-        with pytest.raises(InputError, match=complaint):
+        with pytest.raises(InputError, match=message):
             load_for_planning(str(folder))
     (folder / "changes.json").unlink()
     with pytest.raises(
@@ -186,8 +186,10 @@ def test_pose_run_records_data_limits_and_plans_within_them(make_config, reporte
     recorded = json.loads((folder / "changes.json").read_text())
     source = open_source(read_run_config(folder).data)
     states = [source.read(number).states for number in range(len(source.infos()))]
-    strided_states = [one[first::2] for one in states for first in (0, 1)]
-    expected = np.percentile(np.abs(np.concatenate([actions_from_states(one) for one in strided_states])), 99, axis=0)
+    strided_states = [trajectory[first::2] for trajectory in states for first in (0, 1)]
+    expected = np.percentile(
+        np.abs(np.concatenate([actions_from_states(trajectory) for trajectory in strided_states])), 99, axis=0
+    )
     np.testing.assert_allclose(recorded["changes"], expected, atol=1e-9)
     assert recorded["percentile"] == 99
     subject = load_for_planning(
@@ -230,7 +232,9 @@ def test_limits_beyond_the_training_data_are_logged_as_warnings(
     assert "dx 5 (3) cm, dz 1.2 (1) cm (99th percentile" in subject.warnings[0]
     assert "Set planning.limits.xyz=data" in subject.warnings[0]
     assert subject.as_dict()["warnings"] == list(subject.warnings)
-    assert [(one.levelno, one.getMessage()) for one in caplog.records] == [(logging.WARNING, subject.warnings[0])]
+    assert [(record.levelno, record.getMessage()) for record in caplog.records] == [
+        (logging.WARNING, subject.warnings[0])
+    ]
     caplog.clear()
     Controller.of_run(load_subject(run_with_data_limits))
     assert "dx 5 (3) cm, dy 5 (2) cm, dz 5 (1) cm" in caplog.text
@@ -248,7 +252,7 @@ def test_limits_beyond_the_training_data_are_logged_as_warnings(
 
 
 @pytest.mark.parametrize(
-    ("changes", "complaint"),
+    ("changes", "message"),
     [
         (3, "Expected one number of 0 or more"),
         ([*CHANGES_IN_DATA[:6], "far"], "Expected one number of 0 or more"),
@@ -256,9 +260,9 @@ def test_limits_beyond_the_training_data_are_logged_as_warnings(
         ([30.0, *CHANGES_IN_DATA[1:]], "positions in metres"),
     ],
 )
-def test_invalid_recorded_motions_raise(run_with_data_limits: Path, changes: object, complaint: str) -> None:
+def test_invalid_recorded_motions_raise(run_with_data_limits: Path, changes: object, message: str) -> None:
     write_changes(run_with_data_limits, changes=changes)
-    with pytest.raises(InputError, match=rf"changes\.json: .*{complaint}"):
+    with pytest.raises(InputError, match=rf"changes\.json: .*{message}"):
         load_for_planning(str(run_with_data_limits))
 
 

@@ -80,17 +80,17 @@ def upstream_cost(actions: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("case", json.loads((GOLDEN / "cem.json").read_text()), ids=lambda case: str(case["seed"]))
 def test_cem_equals_the_upstream_plan_for_the_same_seed(case: dict) -> None:
-    given = case["arguments"]
-    closing = given.get("close_gripper")
+    arguments = case["arguments"]
+    closing = arguments.get("close_gripper")
     default_options = {"momentum_mean": 0.25, "momentum_std": 0.95}
-    cem = {"elites": given["topk"], **default_options} | {
-        name: given[name] for name in given if name.startswith("momentum")
+    cem = {"elites": arguments["topk"], **default_options} | {
+        name: arguments[name] for name in arguments if name.startswith("momentum")
     }
     settings = PlanningConfig(
-        horizon=given["rollout"],
-        samples=given["samples"],
-        iterations=given["cem_steps"],
-        limits=LimitsConfig(xyz=(given.get("maxnorm", 0.05),) * 3),
+        horizon=arguments["rollout"],
+        samples=arguments["samples"],
+        iterations=arguments["cem_steps"],
+        limits=LimitsConfig(xyz=(arguments.get("maxnorm", 0.05),) * 3),
         planner={"name": "cem", "options": cem},
     )
     search_space = make_pose_search_space(settings)
@@ -123,14 +123,16 @@ def test_cem_with_jepa_wms_settings_equals_its_plan(case: dict) -> None:
     search_space = make_pose_search_space(settings)
     search_space.std[:, GRIPPER] = 0.1
     plan = Planner(settings, search_space).plan(jepa_wms_cost, torch.Generator().manual_seed(case["seed"]))
-    torch.testing.assert_close([one.lowest for one in plan.iterations], case["losses"], rtol=1e-3, atol=1e-7)
+    torch.testing.assert_close(
+        [iteration.lowest for iteration in plan.iterations], case["losses"], rtol=1e-3, atol=1e-7
+    )
     torch.testing.assert_close(plan.actions, torch.tensor(case["actions"]), atol=1e-5, rtol=1e-3)
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_the_same_seed_gives_the_same_plan_and_another_seed_another(planner: str) -> None:
-    first, again, other = (solve(planner, rosenbrock, space(), seed, iterations=3) for seed in (5, 5, 6))
-    assert torch.equal(first.actions, again.actions)
+    first, repeated, other = (solve(planner, rosenbrock, space(), seed, iterations=3) for seed in (5, 5, 6))
+    assert torch.equal(first.actions, repeated.actions)
     assert first.seed == 5
     assert not torch.equal(first.iterations[0].elites, other.iterations[0].elites)
 
@@ -142,7 +144,7 @@ def test_no_finite_energy_gives_zero_actions(planner: str, energy: float) -> Non
     assert not plan.actions.any()
     assert plan.stopped == "no finite energy"
     assert math.isnan(plan.energy)
-    assert all(one.finite == 0 and one.lowest == math.inf for one in plan.iterations)
+    assert all(iteration.finite == 0 and iteration.lowest == math.inf for iteration in plan.iterations)
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -195,7 +197,7 @@ def test_iterations_stop_before_the_time_budget_is_exceeded(planner: str, budget
     assert len(plan.iterations) == iterations
     assert plan.stopped == ("finished" if iterations == 5 else "out of time")
     assert plan.seconds == iterations
-    assert [one.seconds for one in plan.iterations] == [1.0] * iterations
+    assert [iteration.seconds for iteration in plan.iterations] == [1.0] * iterations
     assert math.isfinite(plan.energy)
 
 

@@ -58,7 +58,7 @@ def test_merged_model_decides_like_the_trained_model(adapter: AdapterConfig, mon
         torch.testing.assert_close(cost(prepare_for_planning(model, PLAIN))(samples), expected, rtol=1e-5, atol=0)
     assert (expected - base_energies).norm() > 1e-3 * base_energies.norm(), "the trained weights change the energies"
     actual = decide(model)
-    monkeypatch.setattr(controller, "prepare_for_planning", lambda given, _: given)
+    monkeypatch.setattr(controller, "prepare_for_planning", lambda world_model, _: world_model)
     np.testing.assert_allclose(actual, decide(model), rtol=0, atol=1e-5)
 
 

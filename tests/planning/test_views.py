@@ -38,10 +38,10 @@ def energies(controller: Controller, actions: torch.Tensor) -> torch.Tensor:
 def test_energy_of_two_views_is_the_mean_of_both() -> None:
     goals, frames = (image(100), image(101)), (image(1), image(2))
     actions = torch.randn(5, 2, 7, generator=torch.Generator().manual_seed(0)) * 0.05
-    both = decide(np.hstack(goals), np.hstack(frames), 2)
-    alone = [energies(decide(goal, frame, 1), actions) for goal, frame in zip(goals, frames, strict=True)]
-    torch.testing.assert_close(energies(both, actions), torch.stack(alone).mean(dim=0))
-    predicted, states = both.decision.cost.rollout(actions)
+    two_views = decide(np.hstack(goals), np.hstack(frames), 2)
+    single_views = [energies(decide(goal, frame, 1), actions) for goal, frame in zip(goals, frames, strict=True)]
+    torch.testing.assert_close(energies(two_views, actions), torch.stack(single_views).mean(dim=0))
+    predicted, states = two_views.decision.cost.rollout(actions)
     tokens = tiny_model().num_tokens
     for number, (goal, frame) in enumerate(zip(goals, frames, strict=True)):
         single_view, single_states = decide(goal, frame, 1).decision.cost.rollout(actions)
@@ -71,9 +71,9 @@ def test_goals_and_video_contain_both_cameras(tmp_path: Path) -> None:
     record_dataset(data, RecordingSpec("A", 9, seed=0, cameras=2), episodes=2)
     config = RldsData(path=str(data), camera=("exterior_1_left", "exterior_2_left"))
     actual = [make_goals(config, "0", KeyFrameOptions(every=4, views=views)) for views in (1, 2)]
-    one, both = (np.stack([made.first, made.goals[0].image]) for made in actual)
-    np.testing.assert_array_equal(both[:, :, : both.shape[2] // 2], one)
-    assert (both[:, :, both.shape[2] // 2 :] != one).any()
+    single_view, two_views = (np.stack([plan_goals.first, plan_goals.goals[0].image]) for plan_goals in actual)
+    np.testing.assert_array_equal(two_views[:, :, : two_views.shape[2] // 2], single_view)
+    assert (two_views[:, :, two_views.shape[2] // 2 :] != single_view).any()
     with pytest.raises(InputError, match=r"data.camera: exterior_1_left. Expected 2 cameras"):
         make_goals(RldsData(path=str(data), camera="exterior_1_left"), "0", KeyFrameOptions(views=2))
 
@@ -93,6 +93,6 @@ def test_image_of_two_views_is_predicted_by_view(tmp_path: Path) -> None:
         actual = imagine_image(session, ImagineOptions(decoder, ("up",), steps=2), ImageObservation(pixels, STATE))
         return np.concatenate([actual.first[None], actual.decoded_first[None], actual.rollouts[0].frames])
 
-    both = predict_frames(np.hstack(images), 2)
+    two_views = predict_frames(np.hstack(images), 2)
     alone = np.concatenate([predict_frames(pixels, 1) for pixels in images], axis=2)
-    assert np.abs(both.astype(int) - alone).max() <= 1
+    assert np.abs(two_views.astype(int) - alone).max() <= 1

@@ -94,9 +94,9 @@ WIDEST = (0.05, 0.03, 0.07, 0.2, 0.2, 0.2, 0.75)
 
 
 def pose(horizon: int = 1, action_repeat: int = 1, **limits: object) -> SearchSpace:
-    given = {"xyz": WIDEST[:3], "rotation": 0.2} | limits
+    limit_values = {"xyz": WIDEST[:3], "rotation": 0.2} | limits
     return make_pose_search_space(
-        PlanningConfig(horizon=horizon, action_repeat=action_repeat, limits=LimitsConfig(**given))
+        PlanningConfig(horizon=horizon, action_repeat=action_repeat, limits=LimitsConfig(**limit_values))
     )
 
 
@@ -128,20 +128,20 @@ def test_zero_motion_is_allowed_with_a_finite_gradient(l1: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mode", "given", "expected"),
+    ("mode", "gripper_change", "expected"),
     [
         ("rounded", 0.24, 0.0), ("rounded", -0.24, 0.0), ("rounded", 0.26, 0.26), ("rounded", 2.0, 0.75),
         ("free", 0.24, 0.24), ("held", 0.5, 0.0), ("open", 0.5, -1.0), ("close", -0.5, 1.0),
     ],
 )  # fmt: skip
-def test_gripper_modes_limit_and_round_the_gripper(mode: str, given: float, expected: float) -> None:
+def test_gripper_modes_limit_and_round_the_gripper(mode: str, gripper_change: float, expected: float) -> None:
     decisions = torch.zeros(1, 7)
-    decisions[0, 6] = given
+    decisions[0, 6] = gripper_change
     assert float(pose(gripper_mode=mode).finalize(decisions)[0, 6]) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
-    ("values", "complaint"),
+    ("values", "message"),
     [
         ({"horizon": 3, "action_repeat": 2}, "multiple of action_repeat"),
         ({"samples": 5}, "more than 5 samples"),
@@ -151,6 +151,6 @@ def test_gripper_modes_limit_and_round_the_gripper(mode: str, given: float, expe
         ({"limits": {"rotation": 10.0}}, "less than or equal to 3.14"),  # degrees
     ],
 )
-def test_inconsistent_settings_raise(values: dict, complaint: str) -> None:
-    with pytest.raises(ValidationError, match=complaint):
+def test_inconsistent_settings_raise(values: dict, message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
         PlanningConfig.model_validate(values)

@@ -71,8 +71,8 @@ def test_search_starts_from_the_mean_and_std_of_the_prior(folder: Path, planner:
         assert not torch.allclose(
             first.mean, make_controller(None, planner=Component(planner), iterations=1, horizon=1).space.lower
         )
-    again = make_controller(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
-    np.testing.assert_array_equal(controller.decision.action, again.decision.action)
+    repeated = make_controller(folder, planner=Component(planner), iterations=1, horizon=1, samples=400)
+    np.testing.assert_array_equal(controller.decision.action, repeated.decision.action)
 
 
 def test_prior_of_several_steps_uses_predicted_frames(tmp_path: Path) -> None:
@@ -114,9 +114,9 @@ def test_prior_training_is_deterministic_and_measures_held_out_errors(make_confi
     """The actions of the episodes are random, so only the goal determines which action leads to it."""
     config, reporter = make_config(), SilentReporter()
     first = train_prior(config, tmp_path / "a", PriorOptions(steps=60, batch_size=8), reporter)
-    again = train_prior(config, tmp_path / "b", PriorOptions(steps=60, batch_size=8))
+    repeated = train_prior(config, tmp_path / "b", PriorOptions(steps=60, batch_size=8))
     assert (tmp_path / "a" / WEIGHTS).read_bytes() == (tmp_path / "b" / WEIGHTS).read_bytes()
-    assert first.held_out == again.held_out
+    assert first.held_out == repeated.held_out
     assert set(first.held_out) == {"clips", "true_goals", "goals_of_others"}
     assert reporter.tasks["training the prior"][-1] == (60, 60)
     assert load_prior(tmp_path / "a", where="test")[0].sizes.ahead == config.data.frames - 1

@@ -118,11 +118,11 @@ def test_views_are_read_side_by_side_as_in_planning(tmp_path: Path) -> None:
         states = np.tile([0.4, 0.0, 0.3, 3.1, 0.0, 0.0, 0.0], (STEPS, 1))
         np.savez(tmp_path / f"{number}.npz", states=states + 0.01 * np.arange(STEPS)[:, None], fps_hz=15.0, **views)
     options = {"source": "npz", "frames": 3, "stride": STRIDE, "workers": 0}
-    both = open_dataset(tmp_path, camera=("frames", "right"), **options)
-    policy = PolicyChunks("policy", ((both.table.identity(1), 3),), np.zeros((1, 1, 4, 7)) + 0.4)
+    two_views = open_dataset(tmp_path, camera=("frames", "right"), **options)
+    policy = PolicyChunks("policy", ((two_views.table.identity(1), 3),), np.zeros((1, 1, 4, 7)) + 0.4)
     controller = RecordingController(tiny_model(), PlanningConfig(views=2))
-    score_policies(controller, both, [policy])
-    expected = [both.source.read(1, camera).read_frames([3])[0] for camera in ("frames", "right")]
+    score_policies(controller, two_views, [policy])
+    expected = [two_views.source.read(1, camera).read_frames([3])[0] for camera in ("frames", "right")]
     np.testing.assert_array_equal(controller.frames[0], np.hstack(expected))
     with pytest.raises(InputError, match=r"data\.camera: frames\. Expected 2 cameras"):
         score_policies(controller, open_dataset(tmp_path, camera="frames", **options), [policy])

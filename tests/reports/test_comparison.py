@@ -68,7 +68,7 @@ def test_gain_over_the_first_run_is_paired_by_clip(tmp_path: Path) -> None:
     assert (gain.low, gain.value, gain.high) == pytest.approx((-1.0, -1.0, -1.0), rel=1e-4)
     assert (gain.better, gain.chance) == ("higher", 0.0)
     assert {row.model for row in comparison.rows} == {"half", "nothing"}
-    assert [one.value for one in comparison.curves["half"]] == pytest.approx([0.5] * 4, rel=1e-4)
+    assert [estimate.value for estimate in comparison.curves["half"]] == pytest.approx([0.5] * 4, rel=1e-4)
     assert comparison.notes == ()
     assert comparison.title.endswith(" episodes")
     shown = str(comparison).splitlines()
@@ -81,17 +81,17 @@ def with_runs(
     comparison: Comparison, conclusion: Conclusion = "yes", **runs: tuple[float | None, float, int]
 ) -> Comparison:
     """Return a comparison of runs with these action-ranking errors, last errors over persistence, and steps."""
-    one, curve = next(iter(comparison.measured.items()))[1], next(iter(comparison.curves.values()))
+    run, curve = next(iter(comparison.measured.items()))[1], next(iter(comparison.curves.values()))
     measured, curves = {}, {}
     for name, (rank, error, step) in runs.items():
-        ranks = replace(one.summary.ranking, value=rank, conclusion=conclusion)
+        ranks = replace(run.summary.ranking, value=rank, conclusion=conclusion)
         about = replace(
-            one.about,
+            run.about,
             checkpoint=f"step-{step:08d} (as requested)",
             checkpoint_path=f"run/step-{step:08d}",
             is_base=not step,
         )
-        measured[name] = replace(one, summary=replace(one.summary, ranking=ranks), about=about)
+        measured[name] = replace(run, summary=replace(run.summary, ranking=ranks), about=about)
         curves[name] = (*curve[:-1], replace(curve[-1], value=error))
     rows = [row for row in comparison.rows if row.key == "gain_over_first"]
     gains = tuple(replace(rows[0], model=name) for name in list(runs)[1:])
@@ -131,12 +131,12 @@ def test_run_without_better_action_ranking_is_not_recommended(two: Comparison, c
 def test_too_few_episodes_give_no_recommendation_and_no_difference(two: Comparison) -> None:
     comparison = with_runs(two, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
     few = "1 held-out episode is too few for a conclusion; at least 5 are needed"
-    summaries = {name: one.summary for name, one in comparison.measured.items()}
+    summaries = {name: run.summary for name, run in comparison.measured.items()}
     summaries = {
-        name: replace(one, prediction=replace(one.prediction, needs=f"{few}. So far: error 1 % lower."))
-        for name, one in summaries.items()
+        name: replace(run, prediction=replace(run.prediction, needs=f"{few}. So far: error 1 % lower."))
+        for name, run in summaries.items()
     }
-    measured = {name: replace(one, summary=summaries[name]) for name, one in comparison.measured.items()}
+    measured = {name: replace(run, summary=summaries[name]) for name, run in comparison.measured.items()}
     rows = tuple(replace(row, low=math.nan, high=math.nan) for row in comparison.rows)
     comparison = replace(comparison, measured=measured, rows=rows)
     assert comparison.next_command == f"No run is recommended: {few}."
@@ -167,14 +167,14 @@ def test_comparison_sentence_has_gain_interval_and_reference(two: Comparison, ga
     ],
 )
 def test_comparing_different_clips_raises(tmp_path: Path, changes: dict[str, object], words: str) -> None:
-    one, other = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle(), **changes)  # type: ignore[arg-type]
+    run, other_run = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle(), **changes)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=f"measured on different clips.*{words}"):
-        compare([one, other])
+        compare([run, other_run])
 
 
 def test_different_latents_give_a_note(tmp_path: Path) -> None:
-    one, other = written(tmp_path / "one", Halfway()), written(tmp_path / "other", Halfway(), seed=5)
-    assert "another encoder or crop" in compare([one, other]).notes[0]
+    run, other_run = written(tmp_path / "one", Halfway()), written(tmp_path / "other", Halfway(), seed=5)
+    assert "another encoder or crop" in compare([run, other_run]).notes[0]
 
 
 def test_unevaluated_run_raises_with_the_command_that_evaluates_it(tmp_path: Path) -> None:
@@ -195,11 +195,11 @@ def test_unevaluated_run_raises_with_the_command_that_evaluates_it(tmp_path: Pat
     ],
 )
 def test_damaged_metrics_file_raises_with_its_path(tmp_path: Path, changes: dict[str, object], words: str) -> None:
-    one, other = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle())
-    metrics = json.loads((other / METRICS_FILE).read_text())
-    (other / METRICS_FILE).write_text(json.dumps(metrics | changes))
+    run, other_run = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle())
+    metrics = json.loads((other_run / METRICS_FILE).read_text())
+    (other_run / METRICS_FILE).write_text(json.dumps(metrics | changes))
     with pytest.raises(InputError, match=words):
-        compare([one, other])
+        compare([run, other_run])
 
 
 def test_comparison_table_has_every_row(tmp_path: Path) -> None:

@@ -42,20 +42,20 @@ def test_each_run_has_its_name_and_a_distinct_line_style(tmp_path, monkeypatch) 
 
 
 def test_formula_like_names_and_missing_images_are_plotted(tmp_path) -> None:
-    one = evaluation(others=(r"$\frac$",))
-    assert plot_evaluation(one, tmp_path / "plot.png").stat().st_size > 1000
-    bare = replace(one, examples=tuple(replace(example, frames=None) for example in one.examples))
+    result = evaluation(others=(r"$\frac$",))
+    assert plot_evaluation(result, tmp_path / "plot.png").stat().st_size > 1000
+    bare = replace(result, examples=tuple(replace(example, frames=None) for example in result.examples))
     assert plot_evaluation(bare, tmp_path / "bare.png").stat().st_size > 1000
-    assert plot_evaluation(replace(one, examples=()), tmp_path / "none.png").stat().st_size > 1000
+    assert plot_evaluation(replace(result, examples=()), tmp_path / "none.png").stat().st_size > 1000
 
 
-def pixels_of(found: PlanResult, folder: Path) -> np.ndarray:
-    with Image.open(plot_plan(found, folder / "plan.png")) as image:
+def pixels_of(result: PlanResult, folder: Path) -> np.ndarray:
+    with Image.open(plot_plan(result, folder / "plan.png")) as image:
         return np.array(image.convert("RGB"))
 
 
 def test_energy_slices_add_a_row_to_the_plan_plot(tmp_path: Path) -> None:
-    heights = [pixels_of(found, tmp_path).shape[0] for found in (make_plan_result(), make_plan_result(start=100))]
+    heights = [pixels_of(result, tmp_path).shape[0] for result in (make_plan_result(), make_plan_result(start=100))]
     assert heights == sorted(set(heights), reverse=True)
 
 
@@ -64,21 +64,21 @@ def test_plan_without_finite_energies_is_plotted(tmp_path: Path) -> None:
 
 
 def test_many_goals_and_a_mask_are_shown(tmp_path: Path) -> None:
-    found = make_plan_result(100, 101, 102, 103, nodes=0)
-    plain = pixels_of(found, tmp_path)
+    result = make_plan_result(100, 101, 102, 103, nodes=0)
+    plain = pixels_of(result, tmp_path)
     mask = np.zeros(image(0).shape[:2], bool)
     mask[:30] = True
-    object.__setattr__(found.request, "mask", mask)
-    masked = pixels_of(found, tmp_path)
+    object.__setattr__(result.request, "mask", mask)
+    masked = pixels_of(result, tmp_path)
     assert masked.shape == plain.shape
     assert not np.array_equal(masked, plain)
 
 
 def test_decoded_plan_adds_a_row_even_without_a_plan(tmp_path: Path) -> None:
     decoder = load_decoder(write_decoder(tmp_path / "decoder", tiny_model()))
-    found, path = make_plan_result(start=100), tmp_path / "imagined.png"
-    with Image.open(plot_plan(found, path, imagine_plan(found, decoder))) as picture:
-        assert picture.height > pixels_of(found, tmp_path).shape[0] + 100
+    result, path = make_plan_result(start=100), tmp_path / "imagined.png"
+    with Image.open(plot_plan(result, path, imagine_plan(result, decoder))) as picture:
+        assert picture.height > pixels_of(result, tmp_path).shape[0] + 100
 
 
 def test_images_are_stacked_horizontally_below_their_captions() -> None:

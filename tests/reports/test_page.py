@@ -67,11 +67,11 @@ Usual = tuple[Evaluation, str, Page]
 @pytest.fixture(scope="module")
 def usual(_undrawn: Callable[[pytest.MonkeyPatch], None]) -> Usual:
     """Return an evaluation with all measurements, its page with all figures, and the parsed page."""
-    one = decoded_strips(evaluation(others=("runs/other",)))
+    result = decoded_strips(evaluation(others=("runs/other",)))
     with pytest.MonkeyPatch.context() as patch:
         _undrawn(patch)
-        html = page_of(one)
-    return one, html, Page(html)
+        html = page_of(result)
+    return result, html, Page(html)
 
 
 def leave_figures_empty(patch: pytest.MonkeyPatch) -> None:
@@ -87,14 +87,14 @@ def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def images(html: str) -> list[bytes]:
     """Return the content of every image."""
-    return [base64.b64decode(one) for one in re.findall('base64,([^"]*)"', html)]
+    return [base64.b64decode(data) for data in re.findall('base64,([^"]*)"', html)]
 
 
 @pytest.mark.usefixtures("without_figures")
 def test_first_screen_shows_the_console_summary_and_further_numbers(usual: Usual) -> None:
-    for one, changes in ((usual[0], {}), (evaluation(episodes=2, clips=8), {"planning": SOLVED})):
-        summary = replace(summarize(one, make_rows(one)), **changes)
-        first = render_page(one, summary).partition("<details")[0]
+    for result, changes in ((usual[0], {}), (evaluation(episodes=2, clips=8), {"planning": SOLVED})):
+        summary = replace(summarize(result, make_rows(result)), **changes)
+        first = render_page(result, summary).partition("<details")[0]
         shown = " ".join(Page(re.sub("<[^>]*>", " ", first.partition("</style>")[2])).shown.split())
         printed = [line for line in str(summary).splitlines() if not line.startswith("  Brackets: ")]
         assert not [word for word in " ".join(printed).split() if word not in shown]
@@ -118,12 +118,12 @@ def test_bar_positions_have_the_order_of_their_values() -> None:
 
 
 def test_the_video_shows_the_clip_with_the_median_error_and_is_short_and_small() -> None:
-    one = decoded_strips(evaluation(frames=16), size=256)
-    best = replace(one.decoded.strips[0], why="best")
-    one = replace(one, decoded=replace(one.decoded, strips=(best, one.decoded.strips[1])))
-    video = make_video(one)
+    result = decoded_strips(evaluation(frames=16), size=256)
+    best = replace(result.decoded.strips[0], why="best")
+    result = replace(result, decoded=replace(result.decoded, strips=(best, result.decoded.strips[1])))
+    video = make_video(result)
     assert video.clip.why == "median"
-    assert video.clip is one.decoded.strips[1]
+    assert video.clip is result.decoded.strips[1]
     frames, times = [], []
     for file in images(f'{video.url}"{video.still}"'):
         assert len(file) <= MAX_VIDEO_BYTES
@@ -136,24 +136,24 @@ def test_the_video_shows_the_clip_with_the_median_error_and_is_short_and_small()
             assert np.abs(shown[:256, column * 264 : column * 264 + 256] - true).mean() < 4
 
 
-def named(name: str) -> Evaluation:
+def evaluation_with_names(name: str) -> Evaluation:
     """Return an evaluation in which every user-defined name is this name."""
     form = name.replace("{", "{{").replace("}", "}}") + "{0}"
-    one = decoded_strips(evaluation(id_form=form, others=(name,)))
+    result = decoded_strips(evaluation(id_form=form, others=(name,)))
     return replace(
-        one,
-        about=replace(one.about, subject=name, data=name, checkpoint_path=name, cameras=(name,)),
-        examples=tuple(replace(example, why=name) for example in one.examples),
+        result,
+        about=replace(result.about, subject=name, data=name, checkpoint_path=name, cameras=(name,)),
+        examples=tuple(replace(example, why=name) for example in result.examples),
         notes=(name,),
     )
 
 
 @pytest.mark.usefixtures("drawn")
 def test_hostile_names_change_only_text_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    html = page_of(named(HOSTILE))
+    html = page_of(evaluation_with_names(HOSTILE))
     leave_figures_empty(monkeypatch)
-    harmless, hostile = Page(page_of(named("a/b"))), Page(html)
-    without_breaks = [[one for one in page.elements if one[0] != "wbr"] for page in (harmless, hostile)]
+    harmless, hostile = Page(page_of(evaluation_with_names("a/b"))), Page(html)
+    without_breaks = [[element for element in page.elements if element[0] != "wbr"] for page in (harmless, hostile)]
     assert [tag for tag, _ in without_breaks[0]] == [tag for tag, _ in without_breaks[1]]
     assert [set(attributes) for _, attributes in without_breaks[0]] == [set(a) for _, a in without_breaks[1]]
     assert "script" not in {tag for tag, _ in hostile.elements}
@@ -167,11 +167,11 @@ def test_hostile_names_change_only_text_of_the_page(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.usefixtures("drawn")
 def test_page_is_self_contained_and_deterministic(usual: Usual) -> None:
-    one, html, page = usual
-    links = [one[key] or "" for _, one in page.elements for key in ("href", "src", "srcset") if key in one]
+    result, html, page = usual
+    links = [values[key] or "" for _, values in page.elements for key in ("href", "src", "srcset") if key in values]
     assert all(link.startswith("data:image/") for link in links)
     assert not re.search(r"https?:|//\w|@import|url\(|\bon\w+=|javascript:", re.sub(r"base64,[^\"]*", "", html))
-    assert page_of(one) == html
+    assert page_of(result) == html
 
 
 @pytest.mark.usefixtures("drawn")
@@ -179,24 +179,24 @@ def test_page_stays_below_its_size_limit(usual: Usual, monkeypatch: pytest.Monke
     assert len(usual[1]) < 2_000_000, "with all figures"
     monkeypatch.setattr(write, "figure_to_svg", lambda *_: "")
     rng = np.random.default_rng(0)
-    one = evaluation(frames=16, size=256)
-    noise = rng.integers(0, 256, size=one.examples[0].frames.shape, dtype=np.uint8)
-    html = page_of(replace(one, examples=(replace(one.examples[0], frames=noise),) * 6))
+    result = evaluation(frames=16, size=256)
+    noise = rng.integers(0, 256, size=result.examples[0].frames.shape, dtype=np.uint8)
+    html = page_of(replace(result, examples=(replace(result.examples[0], frames=noise),) * 6))
     assert len(html.encode()) < 3_000_000
     assert html.count("data:image/webp") == MAX_CLIPS
 
 
 def test_unmeasured_parts_are_listed_with_the_reason() -> None:
-    one = evaluation(with_base=False)
-    adapter = replace(one.models["adapter"], ranking=None, landscapes=None, distribution=None)
-    bare = replace(one, models={"adapter": adapter}, examples=(), copies=None)
+    result = evaluation(with_base=False)
+    adapter = replace(result.models["adapter"], ranking=None, landscapes=None, distribution=None)
+    bare = replace(result, models={"adapter": adapter}, examples=(), copies=None)
     noted = replace(bare, notes=("--ranking-clips is 0: no energy landscapes.",))
     shown = Page(page_of(noted)).shown
-    for what in (
+    for part in (
         "Comparison with the base model", "Energy landscapes", "Example clips", "Distribution of the predictions",
         "Decoded images",
     ):  # fmt: skip
-        assert f"{what}: not measured." in shown
+        assert f"{part}: not measured." in shown
     assert "Energy landscapes: not measured. --ranking-clips is 0: no" in shown
     assert "`" not in shown, "a command is shown as code"
     written = metrics_as_dict(noted)["not_measured"]
@@ -206,10 +206,10 @@ def test_unmeasured_parts_are_listed_with_the_reason() -> None:
 
 
 def test_single_episode_without_images_has_no_intervals_and_no_nan() -> None:
-    one = evaluation(episodes=1)
-    html = page_of(replace(one, examples=tuple(replace(example, frames=None) for example in one.examples)))
+    result = evaluation(episodes=1)
+    html = page_of(replace(result, examples=tuple(replace(example, frames=None) for example in result.examples)))
     assert not re.search(r"\bnan\b|\binf\b", re.sub(r"base64,[^\"]*", "", html))
-    assert html.count("data:image/webp") == len(one.examples)
+    assert html.count("data:image/webp") == len(result.examples)
 
 
 def test_images_are_described_tables_have_captions_and_headings_do_not_jump(usual: Usual) -> None:
@@ -233,9 +233,9 @@ def page() -> str:
 @pytest.mark.usefixtures("drawn")
 def test_page_opens_in_a_browser_without_errors_or_requests(tmp_path) -> None:
     (tmp_path / "report.html").write_text(page(), encoding="utf-8")
-    seen = open_page(tmp_path / "report.html", tmp_path)
-    assert (seen.console, seen.requests) == ((), ())
-    assert "Model and data" in seen.dom
+    opened = open_page(tmp_path / "report.html", tmp_path)
+    assert (opened.console, opened.requests) == ((), ())
+    assert "Model and data" in opened.dom
 
 
 @pytest.mark.slow
@@ -243,6 +243,6 @@ def test_page_opens_in_a_browser_without_errors_or_requests(tmp_path) -> None:
 def test_content_security_policy_blocks_injected_scripts(tmp_path) -> None:
     injected = tmp_path / "injected.html"
     injected.write_text(page().replace("<main>", '<main><script>document.title = "run"</script>'), encoding="utf-8")
-    seen = open_page(injected, tmp_path)
-    assert "<title>run</title>" not in seen.dom
-    assert any("Content Security Policy" in line for line in seen.console)
+    opened = open_page(injected, tmp_path)
+    assert "<title>run</title>" not in opened.dom
+    assert any("Content Security Policy" in line for line in opened.console)

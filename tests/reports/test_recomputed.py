@@ -110,12 +110,12 @@ def recomputed(metrics: dict[str, Any]) -> dict[str, tuple[str, str, str]]:
     def landscape(model: str) -> tuple[tuple[float, float, float], float, float]:
         maps = models[model]["landscapes"]["maps"]
         chances, sharpness = [], []
-        for one in maps:
-            points = np.stack(np.meshgrid(*one["axes"], indexing="ij"), axis=-1).reshape(-1, 3)
-            chances.append(np.linalg.norm(points - one["true"], axis=1).mean())
-            sharpness.append(np.ptp(one["energy"]) / np.mean(one["energy"]))
-        distances = [math.dist(one["minimum"], one["true"]) for one in maps]
-        episodes = [one["episode_id"] for one in maps]
+        for energy_map in maps:
+            points = np.stack(np.meshgrid(*energy_map["axes"], indexing="ij"), axis=-1).reshape(-1, 3)
+            chances.append(np.linalg.norm(points - energy_map["true"], axis=1).mean())
+            sharpness.append(np.ptp(energy_map["energy"]) / np.mean(energy_map["energy"]))
+        distances = [math.dist(energy_map["minimum"], energy_map["true"]) for energy_map in maps]
+        episodes = [energy_map["episode_id"] for energy_map in maps]
         return mean(distances, episodes), float(np.mean(chances)), float(np.mean(sharpness))
 
     (distance, low, high), chance, sharpness = landscape(name)
@@ -145,12 +145,12 @@ def test_the_conclusions_follow_from_paired_differences_in_metrics_json(tmp_path
     ids = written["adapter"]["ranking"]["episode_ids"]
     maps, base_maps = (written[name]["landscapes"]["maps"] for name in ("adapter", "base"))
     distances = [
-        math.dist(one["minimum"], one["true"]) - math.dist(other["minimum"], other["true"])
-        for one, other in zip(maps, base_maps, strict=True)
+        math.dist(energy_map["minimum"], energy_map["true"]) - math.dist(base_map["minimum"], base_map["true"])
+        for energy_map, base_map in zip(maps, base_maps, strict=True)
     ]
     for key, values, episode_ids in (
         ("ranking.difference_to_base", np.subtract(ranks, base_ranks), ids),
-        ("landscapes.distance.difference_to_base", distances, [one["episode_id"] for one in maps]),
+        ("landscapes.distance.difference_to_base", distances, [energy_map["episode_id"] for energy_map in maps]),
     ):
         row = metrics.of(key)
         assert row is not None

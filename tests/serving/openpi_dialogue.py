@@ -28,11 +28,11 @@ def dialogue(policy):
     except RuntimeError as error:
         results["error"] = str(error)
     third = policy.infer({"observation/image": make_image(2), "observation/state": STATE})
-    again = policy.infer(
+    repeated = policy.infer(
         {"observation/image": make_image(0), "observation/state": STATE, "goal/image": make_image(100), "reset": True}
     )
-    results["actions"] = [reply["actions"].tolist() for reply in (first, second, third, again)]
-    results["why"] = [reply["why"] for reply in (first, second, third, again)]
+    results["actions"] = [reply["actions"].tolist() for reply in (first, second, third, repeated)]
+    results["why"] = [reply["why"] for reply in (first, second, third, repeated)]
     broker = action_chunk_broker.ActionChunkBroker(policy, action_horizon=2)
     request = {"observation/image": make_image(3), "observation/state": STATE, "prompt": "cup"}
     results["one_by_one"] = [broker.infer(request)["actions"].tolist() for _ in range(2)]

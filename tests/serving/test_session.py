@@ -87,8 +87,8 @@ def test_named_goal_or_prompt_selects_a_goal_of_the_server() -> None:
 def test_new_goal_reset_or_session_id_starts_a_new_episode() -> None:
     served = session()
     first = ask(served, **request(0, goal_image=image(100), session_id="a"))["actions"]
-    again = ask(served, **request(0, goal_image=image(100), session_id="a"))["actions"]
-    assert not np.array_equal(first, again), "the second decision has another seed"
+    repeated = ask(served, **request(0, goal_image=image(100), session_id="a"))["actions"]
+    assert not np.array_equal(first, repeated), "the second decision has another seed"
     for keys in ({"session_id": "b"}, {"session_id": "b", "reset": True}):
         reply = ask(served, **request(0, goal_image=image(100), **keys))["actions"]
         np.testing.assert_array_equal(reply, first)

@@ -81,9 +81,9 @@ def test_skipped_rays_change_no_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
         sparing.set_joints(joints, 0.0)
         thorough.set_joints(joints, 0.0)
         with monkeypatch.context() as patch:
-            seen = sparing.image()
+            rendered = sparing.image()
             patch.setattr(View, "near_arm", lambda view, *_: np.arange(len(view.rays)))
-            np.testing.assert_array_equal(seen, thorough.image())
+            np.testing.assert_array_equal(rendered, thorough.image())
 
 
 def test_textures_are_random_and_moving_objects_circle_without_contact() -> None:
@@ -107,10 +107,10 @@ def test_textures_are_random_and_moving_objects_circle_without_contact() -> None
         assert 0.001 < (before != images[-1]).any(axis=2).mean() < 0.1, "two small things have moved"
         if block is not None:
             np.testing.assert_allclose(arm.block, block, atol=1e-3)
-    again = SimulatedArm(domain)
+    repeated = SimulatedArm(domain)
     for _ in range(4):
-        again.command_joints(again.joints, 0.0)
-    np.testing.assert_array_equal(again.image(), images[-1])
+        repeated.command_joints(repeated.joints, 0.0)
+    np.testing.assert_array_equal(repeated.image(), images[-1])
 
 
 def test_missing_mujoco_raises_with_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,11 +124,11 @@ def test_contact_arm_in_free_space_follows_like_kinematic_arm(domain: Domain) ->
     free, touching = SimulatedArm(domain), ContactArm(domain)
     for step in range(3):
         target = free.state + np.array([0.05, -0.05, -0.04, 0.0, 0.0, 0.0, 0.3])
-        one, other = free.command(target, 4), touching.command(target, 4)
-        np.testing.assert_allclose(other[:3], one[:3], atol=2e-3)
-        turn = matrices_from_euler(other[3:6]) @ matrices_from_euler(one[3:6]).T
+        free_state, touching_state = free.command(target, 4), touching.command(target, 4)
+        np.testing.assert_allclose(touching_state[:3], free_state[:3], atol=2e-3)
+        turn = matrices_from_euler(touching_state[3:6]) @ matrices_from_euler(free_state[3:6]).T
         assert np.arccos(min(1.0, (np.trace(turn) - 1) / 2)) < 0.01
-        assert other[6] == pytest.approx(one[6], abs=0.02), step
+        assert touching_state[6] == pytest.approx(free_state[6], abs=0.02), step
 
 
 def test_block_is_placed_and_falls_on_the_table() -> None:

@@ -39,16 +39,16 @@ def test_joint_model_acts_in_joint_space(
     of_joints: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model, config = of_joints
-    given = ["simulate", model, "--config", str(config), "--domain", "B", *TWICE, "--out", str(tmp_path), *SMALL]
-    assert main([*given, "planning.limits.axes=[0.2]"]) == 0
+    arguments = ["simulate", model, "--config", str(config), "--domain", "B", *TWICE, "--out", str(tmp_path), *SMALL]
+    assert main([*arguments, "planning.limits.axes=[0.2]"]) == 0
     assert metrics(tmp_path)["policies"]["model"]["why_counts"] == {"planned": 4}
     distances = np.array(metrics(tmp_path)["policies"]["model"]["by_episode"]["distance_cm"])
     assert (np.abs(np.diff(distances, axis=1)) > 0.1).all(), "the arm moves"
     capsys.readouterr()
-    assert main(given) == 2
+    assert main(arguments) == 2
     assert "planning.limits.axes: data, but the model has no record" in capsys.readouterr().err
     (tmp_path / "other.yaml").write_text(config.read_text().replace("joint_position", "other"))
-    assert main([*given, "--config", str(tmp_path / "other.yaml"), "planning.limits.axes=[0.2]"]) == 2
+    assert main([*arguments, "--config", str(tmp_path / "other.yaml"), "planning.limits.axes=[0.2]"]) == 2
     assert "states that the simulated arm does not measure" in capsys.readouterr().err
 
 
@@ -84,14 +84,14 @@ def test_simulate_prints_each_policy_and_writes_json_and_video(
     assert list(reported["policies"]) == list(rows)
     assert reported["verdict"]["conclusion"] == "inconclusive"
     assert reported["about"]["planning"]["samples"] == 6
-    for name, one in reported["policies"].items():
-        distances = np.array(one["by_episode"]["distance_cm"])
+    for name, policy in reported["policies"].items():
+        distances = np.array(policy["by_episode"]["distance_cm"])
         assert distances.shape == (2, 3)
-        assert one["final_distance_cm"]["value"] == pytest.approx(distances[:, -1].mean(), abs=1e-3)
-        assert one["by_episode"]["success"] == (distances[:, -1] < 5).tolist()
-        assert f"{one['final_distance_cm']['value']:.1f} [" in rows[name]
+        assert policy["final_distance_cm"]["value"] == pytest.approx(distances[:, -1].mean(), abs=1e-3)
+        assert policy["by_episode"]["success"] == (distances[:, -1] < 5).tolist()
+        assert f"{policy['final_distance_cm']['value']:.1f} [" in rows[name]
     assert reported["policies"]["tiny"]["why_counts"] == {"planned": 4}
-    starts = [one["by_episode"]["distance_cm"][0][0] for one in reported["policies"].values()]
+    starts = [policy["by_episode"]["distance_cm"][0][0] for policy in reported["policies"].values()]
     assert starts == starts[:1] * 4  # the same problems for all
     assert (
         read_header(tmp_path / VIDEO_FILE, where="film").num_frames == 4 + 1 + 4
@@ -128,8 +128,8 @@ def test_non_finite_model_returns_zero_actions_and_exits_with_status_1(
 def test_invalid_simulate_options_print_one_error_line(
     words: list[str], wrong: str, model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = [word.format(model=model, here=tmp_path) for word in words]
-    assert main(["simulate", *given]) == 2
+    arguments = [word.format(model=model, here=tmp_path) for word in words]
+    assert main(["simulate", *arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert wrong in error
@@ -137,15 +137,15 @@ def test_invalid_simulate_options_print_one_error_line(
 
 
 def test_sub_goals_come_from_a_demonstration_of_the_same_problem(model: str, tmp_path: Path) -> None:
-    given = ["simulate", model, "--task", "reach", "--episodes", "1", "--steps", "4", "--films", "0", *SMALL]
-    found = {}
-    ways_to_give = {name: ["--sub-goals", name] for name in ("demonstration", "every-step")}
-    for name, more in {"single": [], **ways_to_give}.items():
-        assert main([*given, *more, "--out", str(tmp_path / name)]) == 0
-        found[name] = metrics(tmp_path / name)
-    assert [one["about"]["sub_goals"] for one in found.values()] == ["none", *ways_to_give]
-    ways = [one["policies"]["tiny"]["by_episode"]["distance_cm"] for one in found.values()]
-    assert ways[0] != ways[1] != ways[2] != ways[0]
+    arguments = ["simulate", model, "--task", "reach", "--episodes", "1", "--steps", "4", "--films", "0", *SMALL]
+    runs = {}
+    goal_options = {name: ["--sub-goals", name] for name in ("demonstration", "every-step")}
+    for name, more in {"single": [], **goal_options}.items():
+        assert main([*arguments, *more, "--out", str(tmp_path / name)]) == 0
+        runs[name] = metrics(tmp_path / name)
+    assert [run["about"]["sub_goals"] for run in runs.values()] == ["none", *goal_options]
+    distances = [run["policies"]["tiny"]["by_episode"]["distance_cm"] for run in runs.values()]
+    assert distances[0] != distances[1] != distances[2] != distances[0]
     for name in ("zero action", "oracle"):
-        one, *others = (run["policies"][name]["by_episode"]["distance_cm"] for run in found.values())
-        assert others == [one, one], "only the model has goals on the way"
+        single, *with_sub_goals = (run["policies"][name]["by_episode"]["distance_cm"] for run in runs.values())
+        assert with_sub_goals == [single, single], "only the model uses sub-goals"

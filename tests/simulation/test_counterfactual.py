@@ -64,9 +64,9 @@ def test_resimulation_equals_recorded_states_and_images(name: str, index: int, r
         source = RldsSource(DataConfig(path=str(recorded(name)), camera=tuple(cameras)))
         episode = source.read(index, camera)
         for step in (0, len(episode.states) - 1):
-            seen = resimulate(recorded(name), episode, step, camera).simulate(np.zeros((0, 7)), STRIDE)
-            np.testing.assert_allclose(seen.states[0], episode.states[step], atol=1e-6, rtol=0)
-            np.testing.assert_array_equal(seen.frames[0], episode.read_frames([step])[0])
+            outcome = resimulate(recorded(name), episode, step, camera).simulate(np.zeros((0, 7)), STRIDE)
+            np.testing.assert_allclose(outcome.states[0], episode.states[step], atol=1e-6, rtol=0)
+            np.testing.assert_array_equal(outcome.frames[0], episode.read_frames([step])[0])
 
 
 def test_named_actions_move_the_hand_in_their_direction(start: Resimulation) -> None:
@@ -77,7 +77,10 @@ def test_named_actions_move_the_hand_in_their_direction(start: Resimulation) -> 
     assert left.states[-1, 1] - right.states[-1, 1] > 0.15
     assert np.abs(left.states[-1, [0, 2]] - right.states[-1, [0, 2]]).max() < 0.01
     arm = start.arm
-    pixels = {name: hand_pixel(arm, one.states[-1]) for name, one in (("none", none), ("up", up), ("left", left))}
+    pixels = {
+        name: hand_pixel(arm, simulated_outcome.states[-1])
+        for name, simulated_outcome in (("none", none), ("up", up), ("left", left))
+    }
     assert pixels["up"][1] < pixels["none"][1] - 8
     across = pixel_of(arm, none.states[-1, :3] + [0, 0.05, 0])[0] - pixel_of(arm, none.states[-1, :3])[0]
     assert (pixels["left"][0] - hand_pixel(arm, right.states[-1])[0]) * np.sign(across) > 15
@@ -91,18 +94,18 @@ def test_named_actions_move_the_hand_in_their_direction(start: Resimulation) -> 
 def test_resimulation_starts_at_recorded_state_and_outcomes_are_independent(start: Resimulation) -> None:
     first = start.simulate(make_named_actions("forward", 1), STRIDE)
     start.simulate(make_named_actions("down", 2), STRIDE)
-    again = start.simulate(make_named_actions("forward", 1), STRIDE)
+    repeated = start.simulate(make_named_actions("forward", 1), STRIDE)
     assert first.frames.shape == (2, 180, 320, 3)
-    np.testing.assert_array_equal(first.frames, again.frames)
-    np.testing.assert_array_equal(first.states, again.states)
+    np.testing.assert_array_equal(first.frames, repeated.frames)
+    np.testing.assert_array_equal(first.states, repeated.states)
 
 
 def test_resimulating_other_data_raises(recorded, droid: Path) -> None:
-    ours = episode_of(recorded("A"))
+    recorded_episode = episode_of(recorded("A"))
     for episode, step, camera, message in (
         (episode_of(droid), 0, "exterior_1_left", "an unknown episode"),
-        (ours, STEPS, "exterior_1_left", "Expected 0 to 12"),
-        (ours, 0, "front", "one of exterior_1_left"),
+        (recorded_episode, STEPS, "exterior_1_left", "Expected 0 to 12"),
+        (recorded_episode, 0, "front", "one of exterior_1_left"),
     ):
         with pytest.raises(InputError, match=message):
             resimulate(recorded("A"), episode, step, camera)
@@ -110,7 +113,7 @@ def test_resimulating_other_data_raises(recorded, droid: Path) -> None:
 
 def test_docs_example_runs(recorded, capsys: pytest.CaptureFixture[str]) -> None:
     examples = re.findall(r"```py\n(.*?)```", (ROOT / "docs/planning_reference.md").read_text(), flags=re.DOTALL)
-    (example,) = (one for one in examples if "resimulate" in one)
+    (example,) = (text for text in examples if "resimulate" in text)
     exec(example.replace("data/sim", str(recorded("A"))), {})  # noqa: S102 - our own page
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["none", "up", "left", "close"]
 
@@ -132,28 +135,28 @@ def film_of(base_folder: Path, whole_decoder: Path, make_config: MakeConfig, tmp
     def film(data: Path, *actions: str) -> RolloutComparison:
         config = make_config(data__path=str(data), data__validation_share=0.0, data__test_share=0.5)
         evaluation = EvaluationOptions(data=config, out=tmp_path)
-        asked = ImagineOptions(str(whole_decoder), actions=actions, steps=FILMED, evaluation=evaluation)
-        return imagine_clip(str(base_folder), asked, simulate=simulated_outcome)
+        options = ImagineOptions(str(whole_decoder), actions=actions, steps=FILMED, evaluation=evaluation)
+        return imagine_clip(str(base_folder), options, simulate=simulated_outcome)
 
     return film
 
 
 def test_imagine_shows_simulated_truth_for_simulated_data(simulated: Path, film_of) -> None:
-    found = film_of(simulated, "true", "none", "up")
-    truths = {one.name: one.truth for one in found.rollouts}
-    np.testing.assert_array_equal(truths[AS_RECORDED], found.truth)
+    comparison = film_of(simulated, "true", "none", "up")
+    truths = {rollout.name: rollout.truth for rollout in comparison.rollouts}
+    np.testing.assert_array_equal(truths[AS_RECORDED], comparison.truth)
     for truth in truths.values():
         assert truth.shape == (FILMED, 32, 32, 3)
-    still = np.abs(truths["none"].astype(int) - found.first).mean()
-    moved = np.abs(truths["up"].astype(int) - found.first).mean()
+    still = np.abs(truths["none"].astype(int) - comparison.first).mean()
+    moved = np.abs(truths["up"].astype(int) - comparison.first).mean()
     assert moved > 1.5 * still
-    assert all("compared with" in note for note in found.notes)  # the decoder is of other data
-    assert {one.name for one in found.rollouts if one.outlines is not None} == {"none", "up"}
+    assert all("compared with" in note for note in comparison.notes)  # the decoder is of other data
+    assert {rollout.name for rollout in comparison.rollouts if rollout.outlines is not None} == {"none", "up"}
 
 
 def test_failed_resimulation_gives_a_note(simulated: Path, film_of, tmp_path: Path) -> None:
     data = shutil.copytree(simulated, tmp_path / "data")
     (data / SIMULATION_FILE).write_text("{}")
-    found = film_of(data, "up")
-    assert found.notes[-1].startswith("The true outcome of other actions was not simulated: ")
-    assert [one.truth for one in found.rollouts] == [None]
+    comparison = film_of(data, "up")
+    assert comparison.notes[-1].startswith("The true outcome of other actions was not simulated: ")
+    assert [rollout.truth for rollout in comparison.rollouts] == [None]

@@ -39,8 +39,8 @@ def test_measured_poses_lag_behind_commanded_poses() -> None:
     one_later = np.linalg.norm(measured[1:] - commanded[:-1], axis=1).mean()
     assert 0.005 < one_later < same_time < 0.05
     share = tracking_share(DOMAIN_A.lag_s)
-    ways = share * (motion.commanded_joints[:-1] - motion.joints[:-1])
-    np.testing.assert_allclose(np.diff(motion.joints, axis=0), ways, atol=1e-12)
+    expected_changes = share * (motion.commanded_joints[:-1] - motion.joints[:-1])
+    np.testing.assert_allclose(np.diff(motion.joints, axis=0), expected_changes, atol=1e-12)
 
 
 def random_joints(rng: np.random.Generator, spread_rad: float) -> np.ndarray:

@@ -46,9 +46,9 @@ def test_recorded_data_set_is_read_by_the_loader(recorded: Path) -> None:
         episode = record_episode(index, RecordingSpec(DOMAIN_B, STEPS, 3))
         expected[f"{episode.recording_folderpath}--{episode.file_path}"] = episode
     for index, info in enumerate(infos):
-        made, read = expected[info.id], source.read(index)
-        np.testing.assert_allclose(read.states, measured_states(made), atol=1e-6)
-        assert info.success is ("/success/" in made.file_path)
+        drawn, read = expected[info.id], source.read(index)
+        np.testing.assert_allclose(read.states, measured_states(drawn), atol=1e-6)
+        assert info.success is ("/success/" in drawn.file_path)
 
 
 def test_same_seed_gives_same_bytes_with_any_number_of_workers(
@@ -58,11 +58,11 @@ def test_same_seed_gives_same_bytes_with_any_number_of_workers(
     for name in ("random", "socket"):  # as a user may call a script
         Path(f"{name}.py").write_text("open('RAN', 'w')")
     reported = []
-    spec, how = RecordingSpec("B", STEPS, seed=3), {"episodes": EPISODES, "shards": 2, "workers": 2}
-    again = record_dataset(tmp_path / "again", spec, **how, progress=lambda *state: reported.append(state))
+    spec, options = RecordingSpec("B", STEPS, seed=3), {"episodes": EPISODES, "shards": 2, "workers": 2}
+    repeated = record_dataset(tmp_path / "again", spec, **options, progress=lambda *state: reported.append(state))
     assert reported == [(done, EPISODES) for done in range(1, EPISODES + 1)]
     for file in sorted(recorded.iterdir()):
-        assert file.read_bytes() == (again / file.name).read_bytes()
+        assert file.read_bytes() == (repeated / file.name).read_bytes()
     assert not Path("RAN").exists()
 
 
@@ -89,9 +89,9 @@ def test_invalid_recording_options_raise_and_write_nothing(tmp_path: Path) -> No
 
 
 def blocks_of(task: str, seed: int, *, script: bool, steps: int = 41) -> np.ndarray:
-    seen, rng = [], np.random.default_rng(seed)
-    play(arm_for(task, DOMAIN_A), task, steps, rng, script=script, on_step=lambda arm: seen.append(arm.block))
-    return np.array(seen)
+    positions, rng = [], np.random.default_rng(seed)
+    play(arm_for(task, DOMAIN_A), task, steps, rng, script=script, on_step=lambda arm: positions.append(arm.block))
+    return np.array(positions)
 
 
 def test_scripted_episodes_and_random_play_move_the_block() -> None:
@@ -104,8 +104,8 @@ def test_scripted_episodes_and_random_play_move_the_block() -> None:
     assert placed[-1, 2] < 0.035
     assert np.linalg.norm(placed[-1, :2] - placed[0, :2]) > 0.06
     played = [blocks_of("push", seed, script=False, steps=25) for seed in range(3)]
-    ways = [np.linalg.norm(blocks[-1, :2] - blocks[0, :2]) for blocks in played]
-    assert max(ways) > 0.05
+    distances = [np.linalg.norm(blocks[-1, :2] - blocks[0, :2]) for blocks in played]
+    assert max(distances) > 0.05
 
 
 def test_measured_states_follow_commands_repeated_for_a_model_step() -> None:
@@ -149,8 +149,8 @@ def test_folder_without_simulation_file_raises(tmp_path: Path) -> None:
 
 def test_episode_of_another_recording_raises(tmp_path: Path) -> None:
     simulation = read_simulation(written(tmp_path, RecordingSpec("A", 5)))
-    ours = record_name(RecordingSpec("A", 5), 1)
-    assert simulation.number_of(ours) == 1
+    name = record_name(RecordingSpec("A", 5), 1)
+    assert simulation.number_of(name) == 1
     others = [record_name(RecordingSpec("A", 5), 2), record_name(RecordingSpec("A", 5, seed=1), 1)]
     others += [record_name(RecordingSpec("B", 5), 1), "/nfs/AUTOLab/success/2023-07-07/Fri_Jul__7_09:42:23_2023/x.h5"]
     for other in others:

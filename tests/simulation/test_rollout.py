@@ -36,13 +36,13 @@ class Scripted:
     name, why = "scripted", "scripted"
 
     def __init__(self, *actions: np.ndarray) -> None:
-        self.actions, self.seen = list(actions), []
+        self.actions, self.observations = list(actions), []
 
     def reset(self, trial: Trial, goal_image: np.ndarray) -> None:  # noqa: ARG002 - of the protocol
         self.left, self.goal_image = list(self.actions), goal_image
 
     def act(self, observation: Observation) -> np.ndarray:
-        self.seen.append(observation)
+        self.observations.append(observation)
         return self.left.pop(0)
 
 
@@ -51,7 +51,7 @@ def arm() -> SimulatedArm:
     return SimulatedArm(DOMAIN_B, size=(45, 80))
 
 
-def way(*numbers: float) -> np.ndarray:
+def make_action(*numbers: float) -> np.ndarray:
     return np.array([*numbers, *[0.0] * (7 - len(numbers))])
 
 
@@ -92,8 +92,10 @@ def test_oracle_solves_tasks_and_zero_and_random_actions_do_not(task: TaskName, 
 def test_moving_objects_have_equal_start_positions_in_every_episode(task: TaskName) -> None:
     options = BenchmarkOptions(task, replace(DOMAIN_B, moving=3), episodes=2, steps=2, films=2)
     arm = arm_for(task, options.world, size=(45, 80))
-    zero, random, again = (run_task(options, one, arm) for one in (ZeroActions(), RandomActions(SMALL), ZeroActions()))
-    for first, other, repeated in zip(zero.episodes, random.episodes, again.episodes, strict=True):
+    zero, random, zero_again = (
+        run_task(options, policy, arm) for policy in (ZeroActions(), RandomActions(SMALL), ZeroActions())
+    )
+    for first, other, repeated in zip(zero.episodes, random.episodes, zero_again.episodes, strict=True):
         np.testing.assert_array_equal(first.goal_image, other.goal_image)
         np.testing.assert_array_equal(first.frames[0], other.frames[0])
         np.testing.assert_array_equal(first.frames, repeated.frames)
@@ -101,7 +103,7 @@ def test_moving_objects_have_equal_start_positions_in_every_episode(task: TaskNa
 
 
 def test_episode_starts_at_the_start_pose_and_has_the_goal_image(arm: SimulatedArm) -> None:
-    trial, policy = trial_of(1, steps=2), Scripted(way(0.05), way(0.0, 0.05))
+    trial, policy = trial_of(1, steps=2), Scripted(make_action(0.05), make_action(0.0, 0.05))
     result = run_trial(ArmEnvironment(arm), policy, trial, keep_frames=True)
     moved = actions_from_states(np.stack([trial.problem.start, result.states[0]]))  # -pi and pi are one angle
     np.testing.assert_allclose(moved, 0.0, atol=1e-3)
@@ -109,7 +111,7 @@ def test_episode_starts_at_the_start_pose_and_has_the_goal_image(arm: SimulatedA
     assert np.abs(policy.goal_image.astype(int) - arm.image()).mean() < 2.0  # but for the spare joint
     np.testing.assert_array_equal(policy.goal_image, result.goal_image)
     assert (policy.goal_image != result.frames[0]).any()
-    for step, observation in enumerate(policy.seen):
+    for step, observation in enumerate(policy.observations):
         np.testing.assert_array_equal(observation.image, result.frames[step])
         np.testing.assert_array_equal(observation.state, result.states[step])
 
@@ -117,7 +119,7 @@ def test_episode_starts_at_the_start_pose_and_has_the_goal_image(arm: SimulatedA
 def test_joint_actions_move_joints_within_their_limits(arm: SimulatedArm) -> None:
     policy = Scripted(0.1 * np.eye(8)[0], 9.0 * np.eye(8)[1])
     result = run_trial(ArmEnvironment(arm), policy, trial_of(1, steps=2, stride=60))
-    before, after = (observation.joints for observation in policy.seen)
+    before, after = (observation.joints for observation in policy.observations)
     np.testing.assert_allclose(after - before, 0.1 * np.eye(8)[0], atol=1e-3)
     np.testing.assert_allclose(result.states[1][:6], forward_kinematics(after[:7]), atol=1e-6)
     assert result.unreachable == 1, "no joint turns by 9 radians"
@@ -133,13 +135,13 @@ def test_invalid_action_raises(arm: SimulatedArm) -> None:
 
 
 def test_unreachable_command_moves_the_arm_partially_and_is_counted(arm: SimulatedArm) -> None:
-    script = Scripted(way(0.0, 0.0, 1.6), way(0.0, 0.0, 0.05))
+    script = Scripted(make_action(0.0, 0.0, 1.6), make_action(0.0, 0.0, 0.05))
     result = run_trial(ArmEnvironment(arm), script, trial_of(1, steps=2, stride=30))
     risen = result.states[:, 2] - result.states[0, 2]
     assert 0.15 < risen[1] < 1.0
     np.testing.assert_allclose(result.states[1, :2], result.states[0, :2], atol=2e-3)
     assert 1 <= result.unreachable <= 2
-    assert run_trial(ArmEnvironment(arm), Scripted(way(0.0, 0.0, 0.05)), trial_of(1, 1)).unreachable == 0
+    assert run_trial(ArmEnvironment(arm), Scripted(make_action(0.0, 0.0, 0.05)), trial_of(1, 1)).unreachable == 0
 
 
 def test_planner_acts_within_limits_and_stores_frames_of_some_episodes(arm: SimulatedArm) -> None:
@@ -253,7 +255,7 @@ def test_oracle_ignores_gripper_limits_and_reach_has_a_single_goal() -> None:
 
 def test_every_step_sub_goals_stop_where_the_demonstration_stops() -> None:
     arm, trial = arm_for("pick", DOMAIN_A, size=(36, 64)), trial_with_goals("pick", DOMAIN_A, 0, seed=4)
-    key_goals, goals = (demonstrated_goals(trial, arm, USUAL, way) for way in ("demonstration", "every-step"))
+    key_goals, goals = (demonstrated_goals(trial, arm, USUAL, source) for source in ("demonstration", "every-step"))
     for goal, frame in zip(goals, demonstrate(trial, arm, USUAL).frames[1:], strict=False):
         np.testing.assert_array_equal(goal.image, frame)
     np.testing.assert_array_equal(goals[-1].image, key_goals[-1].image)

@@ -30,19 +30,19 @@ TASKS = ["reach", "push", "pick", "place"]
 def test_problems_in_the_world_frame_do_not_depend_on_the_domain(task: str) -> None:
     turn_a, turn_b = (domain.base_pose()[:3, :3] for domain in (DOMAIN_A, DOMAIN_B))
     for index in range(6):
-        one, other = (make_problem(task, domain, 3, index) for domain in (DOMAIN_A, DOMAIN_B))
+        problem_a, problem_b = (make_problem(task, domain, 3, index) for domain in (DOMAIN_A, DOMAIN_B))
         for end in ("block_start", "block_goal") if task != "reach" else ():
-            ours, theirs = getattr(one, end), getattr(other, end)
-            np.testing.assert_allclose(in_world(ours, DOMAIN_A), in_world(theirs, DOMAIN_B), atol=1e-12)
-            assert ours[3] - theirs[3] == pytest.approx(np.deg2rad(DOMAIN_B.base_yaw_deg))
+            pose_a, pose_b = getattr(problem_a, end), getattr(problem_b, end)
+            np.testing.assert_allclose(in_world(pose_a, DOMAIN_A), in_world(pose_b, DOMAIN_B), atol=1e-12)
+            assert pose_a[3] - pose_b[3] == pytest.approx(np.deg2rad(DOMAIN_B.base_yaw_deg))
         for end in ("start", "goal"):
-            ours, theirs = getattr(one, end), getattr(other, end)
-            np.testing.assert_allclose(in_world(ours, DOMAIN_A), in_world(theirs, DOMAIN_B), atol=1e-12)
+            pose_a, pose_b = getattr(problem_a, end), getattr(problem_b, end)
+            np.testing.assert_allclose(in_world(pose_a, DOMAIN_A), in_world(pose_b, DOMAIN_B), atol=1e-12)
             np.testing.assert_allclose(
-                turn_a @ matrices_from_euler(ours[3:6]), turn_b @ matrices_from_euler(theirs[3:6]), atol=1e-9
+                turn_a @ matrices_from_euler(pose_a[3:6]), turn_b @ matrices_from_euler(pose_b[3:6]), atol=1e-9
             )
-            assert np.abs(ours[:3] - theirs[:3]).max() > 0.05  # in the frames of bases that are turned
-            assert ours[6] == theirs[6]
+            assert np.abs(pose_a[:3] - pose_b[:3]).max() > 0.05  # in the frames of bases that are turned
+            assert pose_a[6] == pose_b[6]
 
 
 @pytest.mark.parametrize(
@@ -84,8 +84,8 @@ def test_place_succeeds_if_block_is_released_on_the_mark() -> None:
 
 def test_other_tasks_succeed_by_distance_alone() -> None:
     picked, reached = (make_problem(task, DOMAIN_A, 0, 0) for task in ("pick", "reach"))
-    for height, done in ((0.049, True), (0.051, False)):
-        assert picked.succeeded(picked.start, picked.block_goal - height * np.eye(4)[2]) == done
+    for height, is_success in ((0.049, True), (0.051, False)):
+        assert picked.succeeded(picked.start, picked.block_goal - height * np.eye(4)[2]) == is_success
     assert reached.succeeded(reached.goal)
     assert not reached.succeeded(reached.start)
     turned = reached.goal + np.array([0.03, 0.0, -0.04, 0.2, 0.0, 0.1, 1.0])

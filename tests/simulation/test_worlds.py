@@ -37,24 +37,24 @@ from vjepa2_ac.storage.paths import CLOSED_LOOP_FILE
 SMALL = ["planning.samples=6", "planning.iterations=2", "planning.planner.options.elites=3"]
 
 
-def command(how: str = "") -> str:
-    return shlex.join([sys.executable, fake_world.__file__, how])
+def command(fault: str = "") -> str:
+    return shlex.join([sys.executable, fake_world.__file__, fault])
 
 
 def test_policies_act_on_problems_that_the_expert_solves(
     model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ["simulate", model, "--world", command("sometimes hard"), "--episodes", "3", "--films", "1", "--all"]
-    assert main([*given, "--sub-goals", "every-step", "--out", str(tmp_path), *SMALL]) == 0
+    arguments = ["simulate", model, "--world", command("sometimes hard"), "--episodes", "3", "--films", "1", "--all"]
+    assert main([*arguments, "--sub-goals", "every-step", "--out", str(tmp_path), *SMALL]) == 0
     shown = capsys.readouterr().out
     assert "Come in fake 1.0: 3 problems of seed 0, 3 steps of 0.40 s" in shown
-    found = json.loads((tmp_path / CLOSED_LOOP_FILE).read_text())
-    assert (found["about"]["seeds"], found["about"]["left_out"]) == ([0, 2, 3], [1])
-    assert list(found["policies"]) == ["tiny", "zero action", "random", "expert"]
-    assert found["policies"]["expert"]["success"]["value"] == 1.0
-    still = np.array(found["policies"]["zero action"]["by_episode"]["distance_cm"])
+    results = json.loads((tmp_path / CLOSED_LOOP_FILE).read_text())
+    assert (results["about"]["seeds"], results["about"]["left_out"]) == ([0, 2, 3], [1])
+    assert list(results["policies"]) == ["tiny", "zero action", "random", "expert"]
+    assert results["policies"]["expert"]["success"]["value"] == 1.0
+    still = np.array(results["policies"]["zero action"]["by_episode"]["distance_cm"])
     assert (still == still[:, :1]).all()
-    moved = np.array(found["policies"]["tiny"]["by_episode"]["distance_cm"])
+    moved = np.array(results["policies"]["tiny"]["by_episode"]["distance_cm"])
     np.testing.assert_array_equal(moved[:, 0], still[:, 0])
     assert (np.abs(np.diff(moved, axis=1)) > 0.01).any()
     assert {path.name for path in tmp_path.iterdir()} == {CLOSED_LOOP_FILE, "closed_loop.mp4"}
@@ -63,18 +63,18 @@ def test_policies_act_on_problems_that_the_expert_solves(
 def test_oracle_reaches_the_goal_in_an_external_environment() -> None:
     class Homing(ZeroActions):
         def reset(self, trial: Trial, goal_image: Image) -> None:  # noqa: ARG002
-            self.place = fake_world.draw_block_position(trial.seed)
+            self.block_position = fake_world.draw_block_position(trial.seed)
 
         def _change(self, observation: Observation) -> np.ndarray:
-            return np.append(self.place - observation.state[:3], np.zeros(4))
+            return np.append(self.block_position - observation.state[:3], np.zeros(4))
 
     with ExternalEnvironment(command()) as world:
         trials, shown = find_trials(world, BenchmarkOptions(episodes=4, seed=5), 4)
-        again, shown_again = find_trials(world, BenchmarkOptions(episodes=4, seed=5), 4)
+        repeated, repeated_views = find_trials(world, BenchmarkOptions(episodes=4, seed=5), 4)
         result = run_trials(world, Homing(), trials)
     assert result.success_rate.value == 1.0
-    np.testing.assert_array_equal(shown.distance_cm, shown_again.distance_cm)
-    assert [trial.seed for trial in trials.trials] == [trial.seed for trial in again.trials] == [5, 6, 7, 8]
+    np.testing.assert_array_equal(shown.distance_cm, repeated_views.distance_cm)
+    assert [trial.seed for trial in trials.trials] == [trial.seed for trial in repeated.trials] == [5, 6, 7, 8]
 
 
 def test_recording_resumes_and_is_a_valid_data_set(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_recording_resumes_and_is_a_valid_data_set(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("world", "said"),
+    ("world", "message"),
     [
         ("nowhere/python world.py", "cannot be started: .*nowhere/python"),
         (f"{sys.executable} 'world.py", "cannot be started: No closing quotation"),
@@ -105,9 +105,9 @@ def test_recording_resumes_and_is_a_valid_data_set(tmp_path: Path) -> None:
         (command("hard"), "the expert solves 0 of 4 problems in 3 model steps. Expected at least half of the problems"),
     ],
 )
-def test_unusable_environment_raises(model: str, world: str, said: str) -> None:
+def test_unusable_environment_raises(model: str, world: str, message: str) -> None:
     subject = load_for_planning(model, overrides=SMALL)
-    with pytest.raises(InputError, match=said), ExternalEnvironment(world) as opened:
+    with pytest.raises(InputError, match=message), ExternalEnvironment(world) as opened:
         run_world_benchmark(subject, opened, BenchmarkOptions(episodes=2, films=0))
 
 
@@ -127,10 +127,10 @@ WORLDS = ("robosuite", "libero", "metaworld")
 
 @pytest.mark.parametrize("name", WORLDS)
 def test_environment_pins_agree_and_programs_do_not_import_this_package(name: str) -> None:
-    places = {"Makefile": rf"WORLD_{name} := (.+)", "docs/worlds.md": rf"`{name}.py` \| `pip install ([^`]+)`"}
-    places[f"examples/worlds/{name}.py"] = r"bin/pip install (.+)"
-    pins = {place: re.findall(pattern, (ROOT / place).read_text()) for place, pattern in places.items()}
-    assert len({tuple(found) for found in pins.values()}) == 1, pins
+    patterns = {"Makefile": rf"WORLD_{name} := (.+)", "docs/worlds.md": rf"`{name}.py` \| `pip install ([^`]+)`"}
+    patterns[f"examples/worlds/{name}.py"] = r"bin/pip install (.+)"
+    pins = {path: re.findall(pattern, (ROOT / path).read_text()) for path, pattern in patterns.items()}
+    assert len({tuple(versions) for versions in pins.values()}) == 1, pins
     text = (ROOT / f"examples/worlds/{name}.py").read_text()
     assert not re.search(r"^\s*(from|import) vjepa2_ac", text, flags=re.MULTILINE)
 
@@ -236,7 +236,7 @@ def test_environment_with_unread_requests_raises(program: Program) -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "request_code", "found"),
+    ("first", "request_code", "message"),
     [
         (HELLO, "print(json.dumps(answer) + chr(10) + json.dumps(answer), flush=True)", "after its answer"),
         (HELLO, "print('[' * 100_000, flush=True)", "the program wrote '\\[\\["),
@@ -264,17 +264,17 @@ def test_environment_with_unread_requests_raises(program: Program) -> None:
         ("print(json.dumps(about | {'task': 'x' * 300}), flush=True)", "say()", "task: "),
     ],
 )
-def test_invalid_answer_raises_with_the_command(program: Program, first: str, request_code: str, found: str) -> None:
-    assert re.search(found, fail(program(request_code, first=first)))
+def test_invalid_answer_raises_with_the_command(program: Program, first: str, request_code: str, message: str) -> None:
+    assert re.search(message, fail(program(request_code, first=first)))
 
 
 def test_unrequested_answer_raises(program: Program, tmp_path: Path) -> None:
-    go_on, said = tmp_path / "go on", tmp_path / "said"
+    go_on, marker = tmp_path / "go on", tmp_path / "said"
     wait = f"while not os.path.exists({str(go_on)!r}): time.sleep(0.01)"
-    with ExternalEnvironment(program(f"say()\n    {wait}\n    say()\n    open({str(said)!r}, 'w')")) as world:
+    with ExternalEnvironment(program(f"say()\n    {wait}\n    say()\n    open({str(marker)!r}, 'w')")) as world:
         world.reset(seed=0, options={"stride": 1})
         go_on.touch()
-        wait_until(said.exists)
+        wait_until(marker.exists)
         with pytest.raises(InputError, match="without a request"):
             world.reset(seed=1, options={"stride": 1})
 

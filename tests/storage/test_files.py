@@ -178,9 +178,9 @@ def test_partial_file_of_another_machine_survives_a_clock_jump(
 ) -> None:
     path = tmp_path / ".file.abcdef01.partial"
     path.write_bytes(b"half")
-    now = time.time()
-    os.utime(path, (now, now))
-    monkeypatch.setattr(time, "time", lambda: now + jump_s)
+    current_time_s = time.time()
+    os.utime(path, (current_time_s, current_time_s))
+    monkeypatch.setattr(time, "time", lambda: current_time_s + jump_s)
     remove_abandoned(tmp_path)
     assert path.exists()
 

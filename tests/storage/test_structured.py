@@ -67,7 +67,7 @@ def test_record_is_parsed_from_plain_values() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "complaint"),
+    ("values", "message"),
     [
         ({}, "step: missing"),
         ({"step": "3"}, "step: Input should be a valid integer (found '3')"),
@@ -78,10 +78,10 @@ def test_record_is_parsed_from_plain_values() -> None:
         ({f"k{n}": 1 for n in range(1000)}, "; and 996 more"),
     ],
 )
-def test_values_of_wrong_types_raise_with_their_names(values: dict[str, object], complaint: str) -> None:
+def test_values_of_wrong_types_raise_with_their_names(values: dict[str, object], message: str) -> None:
     with pytest.raises(InputError) as caught:
         parse_record(Sample, values, where="state.json")
-    assert complaint in str(caught.value)
+    assert message in str(caught.value)
     assert len(str(caught.value)) < 500
 
 
@@ -114,7 +114,7 @@ def test_configs_are_read_as_pyyaml_reads_them() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "position", "complaint"),
+    ("text", "position", "message"),
     [
         ("a: 1\nb: 2\na: 3", ": line 3, column 1", "duplicate key 'a'"),
         ("a: &x [1, 2]\nb: [*x, *x]", ": line 2, column 5", "an alias"),
@@ -128,8 +128,8 @@ def test_configs_are_read_as_pyyaml_reads_them() -> None:
         ("a: " + "9" * 5000, "", "digits"),
     ],
 )
-def test_invalid_yaml_raises_with_line_and_column(text: str, position: str, complaint: str) -> None:
+def test_invalid_yaml_raises_with_line_and_column(text: str, position: str, message: str) -> None:
     with pytest.raises(InputError) as caught:
         parse_yaml(text, where="my.yaml")
     assert str(caught.value).startswith(f"my.yaml{position}: invalid YAML")
-    assert complaint in str(caught.value)
+    assert message in str(caught.value)

@@ -23,10 +23,10 @@ CPU = torch.device("cpu")
 
 
 def test_update_to_weight_covers_all_tensors() -> None:
-    one, other = torch.full((2, 2), 3.0), torch.tensor([8.0])  # norm: sqrt(36 + 64) = 10
-    update = Update([one, other])
-    one += 0.3
-    other += 0.8
+    matrix, vector = torch.full((2, 2), 3.0), torch.tensor([8.0])  # norm: sqrt(36 + 64) = 10
+    update = Update([matrix, vector])
+    matrix += 0.3
+    vector += 0.8
     assert update.relative_norm() == pytest.approx(1.0 / 10.0)
 
 

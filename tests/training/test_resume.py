@@ -33,8 +33,8 @@ def test_best_checkpoint_is_discarded_if_the_validation_has_changed(make_config,
 
 
 def test_best_checkpoint_is_kept_after_an_unchanged_resume(make_config, reporter) -> None:
-    now = settings_of(make_config(checkpoint__keep_best="error"))
-    recorded = replace(BEST, validation_settings=now)
+    settings = settings_of(make_config(checkpoint__keep_best="error"))
+    recorded = replace(BEST, validation_settings=settings)
     moved = make_config(
         checkpoint__keep_best="error",
         training__steps=9,
@@ -44,7 +44,7 @@ def test_best_checkpoint_is_kept_after_an_unchanged_resume(make_config, reporter
         validation__batch_size=4,
     )
     assert keep_comparable_best(recorded, settings_of(moved), reporter) == recorded
-    assert keep_comparable_best(BEST, now, reporter) == recorded, "a state without recorded settings is accepted"
+    assert keep_comparable_best(BEST, settings, reporter) == recorded, "a state without recorded settings is accepted"
     assert reporter.notes == []
 
 
@@ -85,8 +85,8 @@ def test_ranking_error_selects_the_best_and_rollout_error_breaks_ties() -> None:
 def test_changed_validation_settings_are_listed(
     make_config, reporter, change: dict[str, object], changed_settings: set[str]
 ) -> None:
-    before, now = settings_of(make_config()), settings_of(make_config(**change))
-    assert {key for key in before | now if before.get(key) != now.get(key)} == changed_settings
-    state = keep_comparable_best(replace(BEST, validation_settings=before), now, reporter)
-    assert (state.best_step, state.best_error, state.validation_settings) == (None, None, now)
+    before, settings = settings_of(make_config()), settings_of(make_config(**change))
+    assert {key for key in before | settings if before.get(key) != settings.get(key)} == changed_settings
+    state = keep_comparable_best(replace(BEST, validation_settings=before), settings, reporter)
+    assert (state.best_step, state.best_error, state.validation_settings) == (None, None, settings)
     assert all(name.replace("its", "validation") in reporter.notes[0] for name in changed_settings)

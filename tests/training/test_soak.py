@@ -62,9 +62,9 @@ def half_written(run: Path) -> set[tuple[str, int]]:
 
 def wait_for_writing(child: Child, checkpoints: Path, times: int) -> None:
     """Wait until a run has begun to write `times` checkpoints, or has ended."""
-    seen: set[str] = set()
-    while len(seen) < times and child.is_running():
-        seen |= {path.name for path in checkpoints.glob(".writing-*")}
+    names: set[str] = set()
+    while len(names) < times and child.is_running():
+        names |= {path.name for path in checkpoints.glob(".writing-*")}
         time.sleep(0.0005)
 
 

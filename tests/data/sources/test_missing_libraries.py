@@ -39,5 +39,5 @@ def test_missing_video_decoder_prevents_indexing(tmp_path: Path, monkeypatch: py
     folder, progress_calls = write_v21(tmp_path / "set", [recorded(0, 20)]), []
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(UnreachableError, match=r"PyAV, which decodes and writes video, is not installed.*pip install"):
-        dataset_of(folder, lambda *done: progress_calls.append(done))
+        dataset_of(folder, lambda *progress: progress_calls.append(progress))
     assert progress_calls == []

@@ -179,11 +179,13 @@ def test_saved_folder_and_exported_official_file_load_the_same_encoder(
 
 def test_exported_official_file_has_metas_name_for_every_tensor(golden: Golden) -> None:
     content = torch.load(golden.path, weights_only=True)
-    theirs = content[golden.facts["checkpoint"]["encoder_key"]]
-    ours = to_official(model_of(golden.path))["encoder"]
-    assert {name.removeprefix("module.") for name in ours} == {name.removeprefix("module.backbone.") for name in theirs}
-    for name, value in ours.items():
-        assert torch.equal(value, theirs[name.replace("module.", "module.backbone.", 1)]), name
+    official = content[golden.facts["checkpoint"]["encoder_key"]]
+    exported = to_official(model_of(golden.path))["encoder"]
+    assert {name.removeprefix("module.") for name in exported} == {
+        name.removeprefix("module.backbone.") for name in official
+    }
+    for name, value in exported.items():
+        assert torch.equal(value, official[name.replace("module.", "module.backbone.", 1)]), name
 
 
 # Wrong files and configs raise, with a fix.

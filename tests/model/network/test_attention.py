@@ -46,7 +46,7 @@ def test_each_token_is_rotated_by_its_time_row_and_column(head_dim: int) -> None
     tokens = torch.randn(shape, generator=torch.Generator().manual_seed(0))
     rotated = rotate(tokens, rotary_tables(layout, head_dim, CPU))
     # The two conditioning tokens of a step have a time, but no row and column.
-    positions = [(time, *place) for time in range(3) for place in [(0, 0), (0, 0), (0, 0), (0, 1), (1, 0), (1, 1)]]
+    positions = [(time, *patch) for time in range(3) for patch in [(0, 0), (0, 0), (0, 0), (0, 1), (1, 0), (1, 1)]]
     for index, position in enumerate(positions):
         expected = torch.tensor(rotate_numbers(tokens[0, index, 0].tolist(), position))
         torch.testing.assert_close(rotated[0, index, 0], expected, rtol=1e-5, atol=1e-6)
