@@ -1,8 +1,10 @@
 """Properties of the training loop: exact resume, gradient accumulation, checks, and allowed config changes."""
 
 import json
+import math
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,11 +18,13 @@ from vjepa2_ac.data.clips import ClipRequest
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.training import outputs, validation
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.step import iterate_batches, training_step
+from vjepa2_ac.training.validation import base_warning
 
 
 def test_resumed_run_equals_an_uninterrupted_run(make_config, reporter, tmp_path, whole_run) -> None:
@@ -115,6 +119,25 @@ def test_base_model_not_better_than_persistence_raises(make_config, reporter) ->
         train(config, reporter)
     assert reporter.steps == []
     assert not Path(config.run_dir).exists(), "a corrected config must be able to use the folder"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "is_warned"),
+    [(0.41, 0.53, True), (0.55, 0.7, True), (0.02, 0.08, False), (math.nan, math.nan, False)],
+)
+def test_base_model_that_ranks_actions_at_chance_is_reported(low: float, high: float, *, is_warned: bool) -> None:
+    ranking = SimpleNamespace(rank=Estimate(0.47, low, high))
+    warning = base_warning(SimpleNamespace(ranking=ranking))
+    assert warning.startswith("Warning: the base model ranks actions no better than chance (47 % [") == is_warned
+    assert bool(warning) == is_warned
+    assert base_warning(SimpleNamespace(ranking=None)) == ""
+
+
+def test_random_weights_as_base_model_are_reported_before_the_first_step(make_config, reporter) -> None:
+    train(make_config(validation__clips=12, validation__ranking_clips=12), reporter, check_only=True)
+    assert any(
+        note.startswith("Warning: the base model ranks actions no better than chance") for note in reporter.notes
+    )
 
 
 def test_check_runs_all_checks_and_writes_nothing(make_config, reporter) -> None:

@@ -17,6 +17,7 @@ from vjepa2_ac.evaluation.action_use import Transition, gather_transitions, rank
 from vjepa2_ac.evaluation.measure import prediction_errors, previous_clip_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Validation, cost_of_actions, one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.summary import CHANCE, format_interval, format_percent
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.runs.metrics_log import MetricsLog
@@ -58,6 +59,21 @@ def action_warning(validation: Validation) -> str:
         f"Warning: shuffled actions change the one-step error by {cost:+.1%} (expected: at least"
         f" +{MIN_ACTION_EFFECT:.0%}). The model ignores its actions and cannot be used for planning. Check the data's"
         " axes and stride (`vjepa2-ac data check`); for training from scratch see docs/encoders.md"
+    )
+
+
+def base_warning(validation: Validation) -> str:
+    """Return a warning if a base model ranks actions no better than chance, otherwise an empty string."""
+    if validation.ranking is None:
+        return ""
+    rank = validation.ranking.rank
+    if not rank.has_interval or rank.high < CHANCE:
+        return ""
+    return (
+        f"Warning: the base model ranks actions no better than chance ({format_percent(rank.value)} %"
+        f" {format_interval(rank)}, chance 50 %). Fine-tuning may lower the prediction error without giving a"
+        " model that can plan. First check data.camera, data.stride and the axes (`vjepa2-ac data check CONFIG --model"
+        " BASE`)"
     )
 
 
@@ -177,6 +193,9 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
         return None
     validation = validate(run, reporter)
     config, error = run.config, one_step_over_persistence(validation.errors).value
+    has_base = not config.model.is_random and run.world_model.new_input_projections is None
+    if has_base and (warning := base_warning(validation)):
+        reporter.note(warning)
     if error < 1.0 or config.training.allow_weak_base or config.model.is_random:
         return validation
     if run.world_model.new_input_projections is not None:
