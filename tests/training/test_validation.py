@@ -1,6 +1,7 @@
 """Validation: action ranking, selection of the best checkpoint, and early stopping."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from vjepa2_ac.data import loader
 from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import Transition
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.runs.subject import describe_selection
@@ -123,3 +125,15 @@ def test_ignored_actions_are_reported_after_warm_up_and_at_the_end(make_config, 
     copying_model = {"model__base": "random", "model__sizes": sizes, "adapter__kind": "none"}
     train(make_config(**EVERY_STEP, **copying_model, training__learning_rate=1e-12, training__warmup_steps=2), reporter)
     assert sum("ignores its actions" in note for note in reporter.notes) == 2
+
+
+@pytest.mark.parametrize(
+    ("high", "words"),
+    [(0.3, "uses its actions little (action-ranking error 21 % [17, 30], chance 50 %)"), (0.6, "ignores its actions")],
+)
+def test_weak_effect_of_actions_is_described_by_the_action_ranking(
+    high: float, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(validation, "cost_of_actions", lambda *_: Estimate(0.012, 0.0, 0.02))
+    ranking = SimpleNamespace(rank=Estimate(0.21, 0.17, high))
+    assert words in validation.action_warning(SimpleNamespace(errors=None, ranking=ranking))

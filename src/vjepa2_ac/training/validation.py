@@ -55,26 +55,38 @@ def action_warning(validation: Validation) -> str:
     cost = cost_of_actions(validation.errors, "shuffled").value
     if cost >= MIN_ACTION_EFFECT:
         return ""
+    ranking, consequence = _describe_ranking(validation), "ignores its actions and cannot be used for planning"
+    if ranking and not _is_at_chance(validation):
+        consequence = f"uses its actions little (action-ranking error {ranking})"
     return (
         f"Warning: shuffled actions change the one-step error by {cost:+.1%} (expected: at least"
-        f" +{MIN_ACTION_EFFECT:.0%}). The model ignores its actions and cannot be used for planning. Check the data's"
-        " axes and stride (`vjepa2-ac data check`); for training from scratch see docs/encoders.md"
+        f" +{MIN_ACTION_EFFECT:.0%}). The model {consequence}. Check the data's axes and stride (`vjepa2-ac data"
+        " check`); for training from scratch see docs/encoders.md"
     )
 
 
 def base_warning(validation: Validation) -> str:
     """Return a warning if a base model ranks actions no better than chance, otherwise an empty string."""
+    if not _is_at_chance(validation):
+        return ""
+    return (
+        f"Warning: the base model ranks actions no better than chance ({_describe_ranking(validation)}). Fine-tuning"
+        " may lower the prediction error without giving a model that can plan. First check data.camera, data.stride and"
+        " the axes (`vjepa2-ac data check CONFIG --model BASE`)"
+    )
+
+
+def _is_at_chance(validation: Validation) -> bool:
+    """Return whether the interval of the action-ranking error includes chance, or is above it."""
+    ranking = validation.ranking
+    return ranking is not None and ranking.rank.has_interval and ranking.rank.high >= CHANCE
+
+
+def _describe_ranking(validation: Validation) -> str:
     if validation.ranking is None:
         return ""
     rank = validation.ranking.rank
-    if not rank.has_interval or rank.high < CHANCE:
-        return ""
-    return (
-        f"Warning: the base model ranks actions no better than chance ({format_percent(rank.value)} %"
-        f" {format_interval(rank)}, chance 50 %). Fine-tuning may lower the prediction error without giving a"
-        " model that can plan. First check data.camera, data.stride and the axes (`vjepa2-ac data check CONFIG --model"
-        " BASE`)"
-    )
+    return f"{format_percent(rank.value)} % {format_interval(rank)}, chance 50 %".replace("  ", " ")
 
 
 def record(run: Run, validation: Validation, metrics_log: MetricsLog | None) -> bool:
