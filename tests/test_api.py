@@ -40,8 +40,8 @@ TINY = "builtin:sim-tiny"
 
 def test_api_page_lists_exactly_the_public_names() -> None:
     table = PAGE.split("| name | description |")[1].split("\n\n")[0]
-    named = re.findall(r"^\| `(\w+)", table, flags=re.MULTILINE)
-    assert sorted(named) == sorted(vjepa2_ac.__all__)
+    documented = re.findall(r"^\| `(\w+)", table, flags=re.MULTILINE)
+    assert sorted(documented) == sorted(vjepa2_ac.__all__)
 
 
 @pytest.mark.parametrize("name", [name for name in vjepa2_ac.__all__ if name[0].islower()])
@@ -179,9 +179,9 @@ def test_frames_and_batches_have_the_same_latents(simulated: Path) -> None:
     batch = next(read_clips(open_dataset(simulated, frames=2), clips=2))
     encoded = encode(model, batch)
     assert batch.frames is not None
-    of_frames = encode(model, batch.frames.numpy())
-    assert tuple(of_frames.shape) == (2, 2, 36, 128)
-    torch.testing.assert_close(of_frames, encoded.latents)
+    frame_latents = encode(model, batch.frames.numpy())
+    assert tuple(frame_latents.shape) == (2, 2, 36, 128)
+    torch.testing.assert_close(frame_latents, encoded.latents)
     image = encode(model, batch.frames.numpy()[1, 0])
     assert tuple(image.shape) == (36, 128)
     torch.testing.assert_close(image, encoded.latents[1, 0], rtol=1e-4, atol=1e-4)

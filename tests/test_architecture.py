@@ -215,13 +215,15 @@ def test_install_hint_names_an_extra_with_the_library() -> None:
     for module, path in modules().items():
         for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "require_library":
-                named = {word.arg: word.value.value for word in node.keywords if isinstance(word.value, ast.Constant)}
+                keywords = {
+                    word.arg: word.value.value for word in node.keywords if isinstance(word.value, ast.Constant)
+                }
                 library = node.args[0].value if isinstance(node.args[0], ast.Constant) else "websockets"  # serve's loop
                 num_checked += 1
                 if str(library).split(".")[0] not in {
-                    requirement.replace("-", "_") for requirement in LIBRARIES_OF_EXTRAS.get(str(named["extra"]), ())
+                    requirement.replace("-", "_") for requirement in LIBRARIES_OF_EXTRAS.get(str(keywords["extra"]), ())
                 }:
-                    wrong.append(f"{module}: {library}: {named['extra']}")
+                    wrong.append(f"{module}: {library}: {keywords['extra']}")
     assert num_checked > 5
     assert not wrong
 

@@ -66,8 +66,8 @@ def test_named_files_exist() -> None:
     wrong = []
     for path in TODAY:
         text = re.sub(r"Source: .*?(?=\n\s*\n|\"\"\"|\Z)", "", path.read_text(), flags=re.DOTALL)
-        named = re.findall(r"(?<![\w./~-])((?:[a-z_]+/)+[A-Za-z_]+\.(?:py|md|yaml|png|sh|txt))\b", text)
-        repository_files = [name for name in named if name.split("/")[0] in OURS]
+        paths = re.findall(r"(?<![\w./~-])((?:[a-z_]+/)+[A-Za-z_]+\.(?:py|md|yaml|png|sh|txt))\b", text)
+        repository_files = [name for name in paths if name.split("/")[0] in OURS]
         wrong += [f"{path.relative_to(ROOT)}: {name}" for name in repository_files if not file_exists(name)]
     assert not wrong, "\n".join(wrong)
 
@@ -77,13 +77,15 @@ def test_named_modules_exist() -> None:
     wrong = []
     for path in [*TODAY, *PACKAGE.rglob("*.jinja")]:
         text = path.read_text()
-        whole = re.findall(r"\bvjepa2_ac\.([a-z_]\w*(?:\.[A-Za-z_]\w*)*)", text)
+        qualified = re.findall(r"\bvjepa2_ac\.([a-z_]\w*(?:\.[A-Za-z_]\w*)*)", text)
         within = re.findall(r"`([a-z_]+(?:\.[A-Za-z_]\w*)+)`", text)
         within = [
             name for name in within if (PACKAGE / name.split(".", maxsplit=1)[0]).is_dir() and not is_config_key(name)
         ]
-        named = [name for name in whole + within if not name.endswith(FILES) and f"vjepa2_ac.{name}" not in GROUPS]
-        wrong += [f"{path.relative_to(ROOT)}: {name}" for name in named if not is_module_or_part_of_one(name)]
+        modules = [
+            name for name in qualified + within if not name.endswith(FILES) and f"vjepa2_ac.{name}" not in GROUPS
+        ]
+        wrong += [f"{path.relative_to(ROOT)}: {name}" for name in modules if not is_module_or_part_of_one(name)]
     assert not wrong, "\n".join(wrong)
 
 
@@ -95,9 +97,9 @@ SECTIONS = (
 def test_named_config_keys_exist() -> None:
     wrong = []
     for path in [path for path in DOCS if path.name not in ("decisions.md", "IMPLEMENTATION_NOTES.md")]:
-        named = re.findall(rf"`((?:{'|'.join(SECTIONS)})\.[a-z_]+(?:\.[a-z_]+)*)(?:[:=][^`]*)?`", path.read_text())
+        keys = re.findall(rf"`((?:{'|'.join(SECTIONS)})\.[a-z_]+(?:\.[a-z_]+)*)(?:[:=][^`]*)?`", path.read_text())
         wrong += [
-            f"{path.name}: {name}" for name in named
+            f"{path.name}: {name}" for name in keys
             if not name.endswith(FILES) and not is_config_key(name) and not is_module_or_part_of_one(name)
         ]  # fmt: skip
     assert not wrong, "\n".join(wrong)
@@ -179,9 +181,11 @@ def test_plan_command_writes_the_documented_keys(
     assert main([*words[1:], "--out", str(tmp_path), "--nodes", "3"]) == 0
     assert "Plan of 1 model step" in capsys.readouterr().out
     table = PLANNING_REFERENCE.split("## plan.json")[1].split("##")[0]
-    named = set(re.findall(r"`([a-z_]+)`", "\n".join(row.split("|")[1] for row in table.splitlines() if "|" in row)))
+    documented = set(
+        re.findall(r"`([a-z_]+)`", "\n".join(row.split("|")[1] for row in table.splitlines() if "|" in row))
+    )
     file = json.loads((tmp_path / "plan.json").read_text())
-    assert set(file) == named
+    assert set(file) == documented
     for section in ("model", "energy", "seconds"):
         (row,) = (row for row in table.splitlines() if row.startswith(f"| `{section}`"))
         assert set(file[section]) <= set(re.findall(r"`([a-z_]+)`", row)), section

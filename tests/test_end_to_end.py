@@ -24,15 +24,15 @@ TINY = {
 
 
 def write_config(folder: Path, name: str, **changes: object) -> str:
-    few = {"data__frames": 3, "data__stride": 4, "data__test_share": 0.3, "training__accumulation": 1}
-    few |= {"training__steps": 3, "training__warmup_steps": 0, "checkpoint__every": 3}
-    config = tiny_config(folder / name, folder / "data", folder / "base", **(few | changes))
+    small_values = {"data__frames": 3, "data__stride": 4, "data__test_share": 0.3, "training__accumulation": 1}
+    small_values |= {"training__steps": 3, "training__warmup_steps": 0, "checkpoint__every": 3}
+    config = tiny_config(folder / name, folder / "data", folder / "base", **(small_values | changes))
     (folder / f"{name}.yaml").write_text(config_as_yaml(config))
     return str(folder / f"{name}.yaml")
 
 
 @pytest.fixture(scope="module")
-def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Create a data set, a base model trained from scratch and an adapter, all with commands."""
     folder = tmp_path_factory.mktemp("workshop")
     data = str(folder / "data")
@@ -53,20 +53,20 @@ FEW = ["--ranking-clips=2", "--samples=6", "--landscapes=1", "--nodes=3", "--exa
 NEWEST = ["--checkpoint", "newest"]  # not the base, which may be selected after so few steps
 
 
-def of_model(metrics: dict, model: str, key: str) -> list[float]:
+def metric_of(metrics: dict, model: str, key: str) -> list[float]:
     """Return the values of a model's rows whose key starts with `key`."""
     return [row["value"] for row in metrics["rows"] if row["model"] == model and row["key"].startswith(key)]
 
 
-def test_evaluate_prints_result_image_and_paths(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", str(workshop / "lora"), *NEWEST, "--clips", "8", "--all", *FEW]) == 0
+def test_evaluate_prints_result_image_and_paths(trained_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(trained_folder / "lora"), *NEWEST, "--clips", "8", "--all", *FEW]) == 0
     printed = capsys.readouterr().out
-    result = json.loads((workshop / "lora" / "metrics.json").read_text())
+    result = json.loads((trained_folder / "lora" / "metrics.json").read_text())
     assert " ".join(result["summary"]["sentence"].split()) in " ".join(printed.split())
-    assert str(workshop / "lora" / "report.html") in printed
-    assert (workshop / "lora" / "evaluation.png").read_bytes().startswith(b"\x89PNG")
+    assert str(trained_folder / "lora" / "report.html") in printed
+    assert (trained_folder / "lora" / "evaluation.png").read_bytes().startswith(b"\x89PNG")
     assert list(result["by_clip"]["models"]) == ["base", "adapter"]
-    assert len(of_model(result, "adapter", "rollout.l1.over_persistence.")) == 2
+    assert len(metric_of(result, "adapter", "rollout.l1.over_persistence.")) == 2
     for word in ("persistence", "base", "adapter", "0.27 s ahead", "zero actions", "shuffled actions"):
         assert word in printed
 
@@ -85,14 +85,14 @@ WRONG = {
 
 @pytest.mark.parametrize(("arguments", "message"), WRONG.values(), ids=WRONG.keys())
 def test_wrong_input_prints_one_error(
-    workshop: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+    trained_folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
-    assert main([word.format(here=workshop) for word in arguments]) == 2
+    assert main([word.format(here=trained_folder) for word in arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert message in error
     assert "Traceback" not in error
-    assert not (workshop / "x").exists()
+    assert not (trained_folder / "x").exists()
 
 
 def test_training_on_real_robot_frames_lowers_the_error(shared: Path, tmp_path: Path) -> None:
@@ -125,19 +125,19 @@ def config_of_encoder(folder: Path, name: str, model: dict[str, object] = MODEL,
 
 
 @pytest.fixture(scope="module")
-def on_an_encoder(workshop: Path) -> Path:
+def encoder_folder(trained_folder: Path) -> Path:
     """Return the same folder after encoding its data and training on the latents."""
-    config = config_of_encoder(workshop, "whole")
+    config = config_of_encoder(trained_folder, "whole")
     assert main(["encode", config]) == 0
     assert main(["train", config, "--check"]) == 0
     assert main(["train", config]) == 0
-    return workshop
+    return trained_folder
 
 
-def test_export_can_be_used_as_base_model(on_an_encoder: Path, tmp_path: Path) -> None:
-    assert main(["export", str(on_an_encoder / "whole"), str(tmp_path / "merged")]) == 0
-    assert main(["export", str(on_an_encoder / "whole"), str(tmp_path / "official.pt"), "--to", "official"]) == 0
-    run = load_subject(on_an_encoder / "whole").world_model.eval()
+def test_export_can_be_used_as_base_model(encoder_folder: Path, tmp_path: Path) -> None:
+    assert main(["export", str(encoder_folder / "whole"), str(tmp_path / "merged")]) == 0
+    assert main(["export", str(encoder_folder / "whole"), str(tmp_path / "official.pt"), "--to", "official"]) == 0
+    run = load_subject(encoder_folder / "whole").world_model.eval()
     sizes = {"image_size": 96, "encoder": {"heads": 4}, "predictor": {"width": 64, "heads": 4}}
     rng = np.random.default_rng(0)
     frames = torch.from_numpy(rng.normal(size=(1, 2, 3, 96, 96))).float()
@@ -153,17 +153,17 @@ def test_export_can_be_used_as_base_model(on_an_encoder: Path, tmp_path: Path) -
     origin = {"file": "vjepa2_1_distilled.pt", "key": "ema_encoder", "licence": "", "heads_are_told": True}
     assert card["encoder_origin"] == origin
     lora = config_of_encoder(
-        on_an_encoder, "adapted", {"base": str(tmp_path / "merged"), "dtype": "float32"}, adapter={"rank": 2}
+        encoder_folder, "adapted", {"base": str(tmp_path / "merged"), "dtype": "float32"}, adapter={"rank": 2}
     )
     assert main(["train", lora, "training.steps=1"]) == 0  # on the same latents: the cache is required
-    assert main(["export", str(on_an_encoder / "adapted"), str(tmp_path / "hub"), "--to", "hub"]) == 0
+    assert main(["export", str(encoder_folder / "adapted"), str(tmp_path / "hub"), "--to", "hub"]) == 0
     words = "V-JEPA 2.1, 12 blocks of 64, 4 heads, each frame as a tubelet; from vjepa2_1_distilled.pt, ema_encoder"
     assert words in (tmp_path / "hub" / "README.md").read_text()
     assert json.loads((tmp_path / "hub" / "vjepa2_ac.json").read_text())["encoder_in_words"] == words
 
 
-def test_latents_of_another_frame_input_raise(on_an_encoder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = config_of_encoder(on_an_encoder, "image", {**MODEL, "encoder": {**ENCODER, "frame": "image"}})
+def test_latents_of_another_frame_input_raise(encoder_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = config_of_encoder(encoder_folder, "image", {**MODEL, "encoder": {**ENCODER, "frame": "image"}})
     assert main(["train", config]) == 2
     error = capsys.readouterr().err
     assert "no latent cache for this model" in error

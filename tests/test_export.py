@@ -101,7 +101,7 @@ def rewrite_adapter(run: Path, **changes: object) -> None:
     write_manifest(checkpoint)
 
 
-def poison(path: Path) -> str:
+def store_nan(path: Path) -> str:
     """Put one NaN into a file of tensors; return the name of the tensor."""
     tensors = load_file(path)
     name = sorted(tensors)[-1]
@@ -125,7 +125,7 @@ def test_non_finite_merge_raises_and_writes_nothing(copied, tmp_path: Path) -> N
 def test_non_finite_weight_raises_with_its_name(copied, tmp_path: Path, kind: str, file: str) -> None:
     run = copied(adapter__kind=kind)
     checkpoint = load_subject(run).checkpoint
-    name = poison(checkpoint / "adapter" / file)
+    name = store_nan(checkpoint / "adapter" / file)
     write_manifest(checkpoint)
     with pytest.raises(InputError, match=rf"{file}: {re.escape(name)} contains NaN or infinity"):
         export_run(run, tmp_path / "out")

@@ -26,7 +26,7 @@ def recipes(*headings: str) -> str:
 
 
 @pytest.fixture
-def at_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def plugin_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working directory with a module of the user's."""
     folder = tmp_path / "home"
     folder.mkdir()
@@ -51,20 +51,20 @@ def test_training_imports_core_packages_only() -> None:
     assert not packages & set(beside.split())
 
 
-def test_plugin_loss_planner_and_energy_work_from_yaml(at_home: Path, make_config) -> None:
-    values = yaml.safe_load(as_yaml(make_config(training__steps=1, run_dir=at_home / "run")))
+def test_plugin_loss_planner_and_energy_work_from_yaml(plugin_folder: Path, make_config) -> None:
+    values = yaml.safe_load(as_yaml(make_config(training__steps=1, run_dir=plugin_folder / "run")))
     values["plugins"] = ["my_module"]
     values["training"] |= {"loss": {"name": "log_cosh", "options": {"scale": 2.0}}}
     values["data"] |= {"workers": 1, "transforms": [{"name": "sensor_noise", "options": {"std": 5.0}}]}
     values["planning"] |= {"planner": "random", "samples": 16, "iterations": 2}
     values["planning"]["energy"] |= {"distance": "largest"}
     values["tracking"] = {"tensorboard": False, "others": {"lines": {"file": "curves.txt"}}}
-    (at_home / "own.yaml").write_text(yaml.safe_dump(values))
+    (plugin_folder / "own.yaml").write_text(yaml.safe_dump(values))
     trained = command("train", "own.yaml")
     assert trained.returncode == 0, trained.stderr
-    assert yaml.safe_load((at_home / "run/config.yaml").read_text())["plugins"] == ["my_module"]
+    assert yaml.safe_load((plugin_folder / "run/config.yaml").read_text())["plugins"] == ["my_module"]
 
-    assert '"train/loss": ' in (at_home / "run/curves.txt").read_text()
+    assert '"train/loss": ' in (plugin_folder / "run/curves.txt").read_text()
 
     for name, brightness in (("now", 90), ("goal", 160)):
         scene = Image.linear_gradient("L").resize((48, 48)).point(lambda value, more=brightness: (value + more) // 2)
@@ -73,7 +73,7 @@ def test_plugin_loss_planner_and_energy_work_from_yaml(at_home: Path, make_confi
     words += ["--out", "out", "planning.limits.xyz=[0.05,0.05,0.05]"]
     planned = command(*words, "--plugin", "my_module")
     assert planned.returncode in {0, 1}, planned.stderr  # 1: a plan that is predicted to be worse than staying
-    assert json.loads((at_home / "out/plan.json").read_text())["settings"]["planner"] == "random"
+    assert json.loads((plugin_folder / "out/plan.json").read_text())["settings"]["planner"] == "random"
 
     # a run may be a stranger's: its config imports nothing that lies beside it
     refused = command(*words)
@@ -82,8 +82,8 @@ def test_plugin_loss_planner_and_energy_work_from_yaml(at_home: Path, make_confi
     assert "--plugin my_module" in refused.stderr
 
 
-def test_plugin_options_and_names_are_validated_with_the_config(at_home: Path, make_config) -> None:
-    (at_home / "own.yaml").write_text(as_yaml(make_config()))
+def test_plugin_options_and_names_are_validated_with_the_config(plugin_folder: Path, make_config) -> None:
+    (plugin_folder / "own.yaml").write_text(as_yaml(make_config()))
     wrong = (
         ("training.loss=log_cosch", "Did you mean log_cosh?"),
         ("training.loss.options={scale: much}", "scale"),
@@ -99,7 +99,7 @@ def test_plugin_options_and_names_are_validated_with_the_config(at_home: Path, m
     assert (missing.returncode, "no such module" in missing.stderr) == (2, True)
 
 
-@pytest.mark.usefixtures("at_home")
+@pytest.mark.usefixtures("plugin_folder")
 def test_config_schema_contains_plugin_options() -> None:
     schema = json.loads(command("config", "schema", "--plugin", "my_module").stdout)
     training = schema["$defs"]["TrainingConfig"]["properties"]
@@ -108,24 +108,24 @@ def test_config_schema_contains_plugin_options() -> None:
     assert "scale" in with_options[-1]["properties"]["options"]["properties"]
 
 
-def installed(at_home: Path, entry_points: str, code: str, *words: str) -> subprocess.CompletedProcess[str]:
+def installed(plugin_folder: Path, entry_points: str, code: str, *words: str) -> subprocess.CompletedProcess[str]:
     """Run a command where a package of the user's is installed: its metadata is what an installation leaves."""
-    leave_package(at_home / "site", "my_package", entry_points, code)
-    program = at_home.parent / "program.py"
+    leave_package(plugin_folder / "site", "my_package", entry_points, code)
+    program = plugin_folder.parent / "program.py"
     program.write_text("import sys; sys.path.append('site'); from vjepa2_ac.cli import main; sys.exit(main())")
-    return nursery().run(str(program), *words, folder=at_home.parent)
+    return nursery().run(str(program), *words, folder=plugin_folder.parent)
 
 
-def test_installed_plugin_is_found_by_its_entry_point(at_home: Path, make_config) -> None:
-    (at_home / "own.yaml").write_text(as_yaml(make_config()))
+def test_installed_plugin_is_found_by_its_entry_point(plugin_folder: Path, make_config) -> None:
+    (plugin_folder / "own.yaml").write_text(as_yaml(make_config()))
     words = ["config", "show", "own.yaml", "training.loss=log_cosh", "training.loss.options={scale: 3}"]
-    process = installed(at_home, "[vjepa2_ac.losses]\nlog_cosh = my_package:LogCosh\n", recipes("A loss"), *words)
+    process = installed(plugin_folder, "[vjepa2_ac.losses]\nlog_cosh = my_package:LogCosh\n", recipes("A loss"), *words)
     assert process.returncode == 0, process.stderr
     assert yaml.safe_load(process.stdout)["training"]["loss"]["options"] == {"scale": 3}
 
 
-def test_plugin_data_source_is_recognized_trained_and_evaluated(at_home: Path, base_folder: Path) -> None:
-    data = at_home / "walls"
+def test_plugin_data_source_is_recognized_trained_and_evaluated(plugin_folder: Path, base_folder: Path) -> None:
+    data = plugin_folder / "walls"
     data.mkdir()
     for number in range(6):
         states = np.zeros((24, 7))
@@ -134,16 +134,23 @@ def test_plugin_data_source_is_recognized_trained_and_evaluated(at_home: Path, b
     plugin = ["--plugin", "my_module"]
     process = command("init", "walls", "--model", str(base_folder), "--out", "own.yaml", *plugin)
     assert process.returncode == 0, process.stdout + process.stderr
-    values = yaml.safe_load((at_home / "own.yaml").read_text())
+    values = yaml.safe_load((plugin_folder / "own.yaml").read_text())
     assert (values["data"]["source"], values["data"]["camera"]) == ("wall", "front")
 
-    few = ["data.wall.size=24", "data.frames=4", "data.stride=2", "data.workers=0", "data.cache=off", "run_dir=run"]
-    few += ["training.steps=1", "training.batch_size=2", "training.accumulation=1", "training.warmup_steps=0"]
-    few += ["training.allow_weak_base=true", "validation.clips=2", "validation.ranking_clips=1"]
-    trained = command("train", "own.yaml", *few, *plugin)
+    overrides = [
+        "data.wall.size=24",
+        "data.frames=4",
+        "data.stride=2",
+        "data.workers=0",
+        "data.cache=off",
+        "run_dir=run",
+    ]
+    overrides += ["training.steps=1", "training.batch_size=2", "training.accumulation=1", "training.warmup_steps=0"]
+    overrides += ["training.allow_weak_base=true", "validation.clips=2", "validation.ranking_clips=1"]
+    trained = command("train", "own.yaml", *overrides, *plugin)
     assert trained.returncode == 0, trained.stderr
-    less = ["--clips", "2", "--ranking-clips", "0"]
-    measured = command("evaluate", "run", *plugin, *less)
+    measure_options = ["--clips", "2", "--ranking-clips", "0"]
+    measured = command("evaluate", "run", *plugin, *measure_options)
     assert measured.returncode == 0, measured.stderr
-    keys = {row["key"] for row in json.loads((at_home / "run/metrics.json").read_text())["rows"]}
+    keys = {row["key"] for row in json.loads((plugin_folder / "run/metrics.json").read_text())["rows"]}
     assert any(key.startswith("rollout.largest.") for key in keys), sorted(keys)

@@ -40,8 +40,8 @@ def test_shared_episode_difficulty_does_not_widen_the_difference() -> None:
     rng = np.random.default_rng(0)
     hard = rng.normal(1.0, 0.3, size=20)
     ones, ids = np.ones(20), tuple(map(str, range(20)))
-    apart = estimate_ratio_difference((hard - 0.1, ones), (hard, ones), ids)
-    assert (apart.low, apart.value, apart.high) == pytest.approx((-0.1, -0.1, -0.1))
+    difference = estimate_ratio_difference((hard - 0.1, ones), (hard, ones), ids)
+    assert (difference.low, difference.value, difference.high) == pytest.approx((-0.1, -0.1, -0.1))
     assert estimate_ratio(hard, ones, ids).high - estimate_ratio(hard, ones, ids).low > 0.2
 
 

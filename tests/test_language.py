@@ -101,8 +101,8 @@ def private_words(path: Path, parts: Iterator[str]) -> list[str]:
     allowed = ALLOWED.get(str(path.relative_to(ROOT)), set())
     text = re.sub(r"\s+", " ", "\n".join(parts))
     return [
-        f"{path.relative_to(ROOT)}: {text[max(match.start() - 40, 0) : match.end() + 40]!r}: write {instead}"
-        for words, instead in WRITE_INSTEAD.items()
+        f"{path.relative_to(ROOT)}: {text[max(match.start() - 40, 0) : match.end() + 40]!r}: write {replacement}"
+        for words, replacement in WRITE_INSTEAD.items()
         for match in re.finditer(rf"\b(?:{words})\b", text, flags=re.IGNORECASE)
         if match[0].lower() not in allowed
     ]

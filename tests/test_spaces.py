@@ -113,9 +113,9 @@ def test_invalid_number_raises_at_any_index(column: int, sign: int) -> None:
     wrong = {0: 300.0, 1: 90.0, 2: 1.2 if sign > 0 else 0.2}[column // 3]
     with pytest.raises(InputError, match=message):
         POSE.require_state(changed(column, sign * wrong), "state")
-    for never in (math.nan, sign * math.inf):
-        with pytest.raises(InputError, match=rf"{never}\b.* Expected finite numbers") as caught:
-            POSE.require_state(changed(column, never), "state")
+    for non_finite in (math.nan, sign * math.inf):
+        with pytest.raises(InputError, match=rf"{non_finite}\b.* Expected finite numbers") as caught:
+            POSE.require_state(changed(column, non_finite), "state")
         assert "degrees" not in str(caught.value)
     if column < 6:
         with pytest.raises(InputError, match=message):

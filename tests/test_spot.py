@@ -49,21 +49,21 @@ def command_on_a_skypilot_machine(folder: Path) -> list[str]:
     return (folder / "words").read_text().splitlines()
 
 
-@pytest.mark.parametrize("where", ["kubernetes", "skypilot"])
-def test_commands_of_the_files_are_valid_and_uploads_have_time(where: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("platform", ["kubernetes", "skypilot"])
+def test_commands_of_the_files_are_valid_and_uploads_have_time(platform: str, tmp_path: Path) -> None:
     from torch.distributed.run import config_from_args, parse_args
 
-    words = command_in_a_pod() if where == "kubernetes" else command_on_a_skypilot_machine(tmp_path)
+    words = command_in_a_pod() if platform == "kubernetes" else command_on_a_skypilot_machine(tmp_path)
     options = parse_args(words[1:])
     launch, (command, config, *overrides) = config_from_args(options)[0], options.training_script_args
     assert (words[0], options.training_script, command) == ("torchrun", "vjepa2_ac.cli", "train")
     read = load_config(config if config.startswith("builtin:") else ROOT / config, overrides).checkpoint
     assert str(read.remote).startswith("gs://")
-    notice_s = read_kubernetes_job()[2]["terminationGracePeriodSeconds"] if where == "kubernetes" else 30
+    notice_s = read_kubernetes_job()[2]["terminationGracePeriodSeconds"] if platform == "kubernetes" else 30
     assert read.remote_wait_seconds < launch.shutdown_timeout < notice_s
     assert {"SIGTERM", "SIGUSR1"} <= set(launch.signals_to_handle.split(","))
     assert launch.min_nodes == launch.max_nodes == 2
-    if where == "skypilot":
+    if platform == "skypilot":
         assert (options.node_rank, launch.nproc_per_node, options.master_addr) == (1, 4, "10.0.0.1")
 
 
@@ -134,7 +134,7 @@ def test_run_with_a_preempted_pod_equals_an_uninterrupted_run(
 ) -> None:
     gcs.put("bucket/other", b"1")
     changes = {"adapter__dropout": 0.0, "training__steps": STEPS, "validation__every": STEPS, "checkpoint__every": 20}
-    whole = train(make_config(training__accumulation=2, **changes), reporter)
+    uninterrupted_run = train(make_config(training__accumulation=2, **changes), reporter)
     config = make_config(run_dir="run", training__accumulation=1, **changes)
     (tmp_path / "config.yaml").write_text(config_as_yaml(config))
     pods = Pods(tmp_path / "config.yaml", tmp_path, monkeypatch.chdir)
@@ -150,4 +150,4 @@ def test_run_with_a_preempted_pod_equals_an_uninterrupted_run(
     assert 2 <= read_state(stopped).step < STEPS
     assert resumed_run != stopped.parent
     assert (resumed_run / stopped.name).is_dir(), "a new machine resumed from the checkpoint of the stopped ones"
-    assert_equal_up_to_rounding(whole, resumed_run.parent)
+    assert_equal_up_to_rounding(uninterrupted_run, resumed_run.parent)

@@ -28,13 +28,13 @@ exit $RUN_ENDS_WITH
 """
 
 
-def submit(folder: Path, run_ends_with: int, **more: str) -> tuple[int, list[str]]:
+def submit(folder: Path, run_ends_with: int, **variables: str) -> tuple[int, list[str]]:
     """Run the script as a job of two tasks, with programs that only record their arguments."""
     for name, text in {"srun": SRUN, "scontrol": SCONTROL, "vjepa2-ac": RUN}.items():
         (folder / name).write_text(text)
         (folder / name).chmod(0o755)
     job = {"SLURM_JOB_ID": "123456", "SLURM_NTASKS": "2", "SLURM_JOB_NODELIST": "node[7-8]"}
-    environment = {"PATH": f"{folder}:{os.environ['PATH']}", "RUN_ENDS_WITH": str(run_ends_with), **job, **more}
+    environment = {"PATH": f"{folder}:{os.environ['PATH']}", "RUN_ENDS_WITH": str(run_ends_with), **job, **variables}
     process = subprocess.run(["bash", str(SCRIPT), "my.yaml", "seed=1"], env=environment, cwd=folder, check=False)
     calls = folder / "calls"
     return process.returncode, calls.read_text().splitlines() if calls.exists() else []
@@ -72,13 +72,13 @@ def test_array_task_uses_its_grid_line_and_its_own_folder(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("more", "message"), [({}, "names the file of overrides"), ({"GRID": "sweep.txt"}, "sweep.txt has no line 2")]
+    ("variables", "message"), [({}, "names the file of overrides"), ({"GRID": "sweep.txt"}, "sweep.txt has no line 2")]
 )
 def test_array_without_grid_or_line_starts_no_training(
-    tmp_path: Path, more: dict[str, str], message: str, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, variables: dict[str, str], message: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "sweep.txt").write_text("seed=1\n")
-    status, calls = submit(tmp_path, run_ends_with=0, SLURM_ARRAY_TASK_ID="2", **more)
+    status, calls = submit(tmp_path, run_ends_with=0, SLURM_ARRAY_TASK_ID="2", **variables)
     assert status
     assert calls == []
     assert message in capfd.readouterr().err

@@ -72,8 +72,8 @@ def small(evidence: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[A
         patch.setattr(methods, "STEPS", 2)
         patch.setattr(methods, "TRAINING", methods.TRAINING.model_copy(update={"warmup_steps": 1, "batch_size": 2}))
         patch.setattr(measure, "ValidationConfig", lambda clips, **keys: ValidationConfig(clips=clips // 10, **keys))
-        few = methods.PLANNING.model_copy(update={"samples": 12, "iterations": 1})
-        patch.setattr(measure, "PLANNING", few)
+        quick_planning = methods.PLANNING.model_copy(update={"samples": 12, "iterations": 1})
+        patch.setattr(measure, "PLANNING", quick_planning)
         patch.setattr(measure, "CLIPS", 6)
         patch.setattr(evidence.offline, "MOVES", 2)
         patch.setattr(measure, "train_prior", partial(train_prior, options=PriorOptions(steps=2)))
@@ -154,7 +154,9 @@ def test_adapting_planner_trains_on_its_transitions_only_from_the_second_decisio
     spec = labs.BenchmarkOptions("reach", "A", 1, 0, steps=2)
     labs.run_task(spec, policy)
     assert len(policy.transitions) == 1
-    changed = [not bool((now == then).all()) for now, then in zip(policy.parameters, before, strict=True)]
+    changed = [
+        not bool((current == original).all()) for current, original in zip(policy.parameters, before, strict=True)
+    ]
     assert any(changed)
     frozen = model.base_predictor.blocks[0].state_dict()
     assert all(

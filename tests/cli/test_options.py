@@ -99,8 +99,8 @@ def test_overrides_are_accepted_at_any_position_after_the_positional_arguments(w
         len(words) + (2 if words in {("config",), ("export",), ("data", "convert")} else 1),
     )
     first, second = "planning.samples=64", "data.path=a=b"
-    rest = arguments[start:]
-    for order in ([first, second, *rest], [first, *rest, second], [*rest, first, second]):
+    other_words = arguments[start:]
+    for order in ([first, second, *other_words], [first, *other_words, second], [*other_words, first, second]):
         options = parse_arguments(program._make_parser(), [*arguments[:start], *order])
         assert [override for override in options.overrides if override in {first, second}] == [first, second]
 

@@ -51,10 +51,12 @@ def no_plot(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vjepa2_ac.reports.planning_figures.plot_plan", lambda _, path, *__: path)
 
 
-def plan(folder: Path, *more: str, subject: str = "model", state: str = STATE, goal: str = "goal") -> tuple[int, dict]:
+def plan(
+    folder: Path, *options: str, subject: str = "model", state: str = STATE, goal: str = "goal"
+) -> tuple[int, dict]:
     images = ["--start", str(folder / "start.png"), "--goal", str(folder / f"{goal}.png")]
     out = folder / "out"
-    status = main(["plan", str(folder / subject), *images, "--state", state, "--out", str(out), *more])
+    status = main(["plan", str(folder / subject), *images, "--state", state, "--out", str(out), *options])
     return status, json.loads((out / "plan.json").read_text()) if status < 2 else {}
 
 
@@ -105,7 +107,7 @@ def test_two_goals_divide_the_horizon(folder: Path) -> None:
 
 @pytest.mark.usefixtures("no_plot")
 def test_mask_changes_the_energy(folder: Path) -> None:
-    unmasked, masked = (plan(folder, *QUICK, *more)[1] for more in ([], ["--mask", str(folder / "mask.png")]))
+    unmasked, masked = (plan(folder, *QUICK, *options)[1] for options in ([], ["--mask", str(folder / "mask.png")]))
     assert unmasked["energy"]["now"] != masked["energy"]["now"]
 
 
@@ -145,14 +147,14 @@ WRONG = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("more", "message"), WRONG.values(), ids=WRONG.keys())
+@pytest.mark.parametrize(("options", "message"), WRONG.values(), ids=WRONG.keys())
 def test_invalid_input_prints_one_error_and_writes_no_plan(
-    folder: Path, capsys: pytest.CaptureFixture[str], more: list[str], message: str
+    folder: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
 ) -> None:
     out = folder / "nothing"
     common = ["--start", str(folder / "start.png"), "--state", STATE, "--out", str(out)]
-    goal = [] if "--goal" in more else ["--goal", str(folder / "goal.png")]
-    words = [word.format(folder=folder) if "{folder}" in word else word for word in more]
+    goal = [] if "--goal" in options else ["--goal", str(folder / "goal.png")]
+    words = [word.format(folder=folder) if "{folder}" in word else word for word in options]
     assert main(["plan", str(folder / "model"), *common, *goal, *QUICK, *words]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")

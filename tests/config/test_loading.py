@@ -89,7 +89,7 @@ def test_option_names_that_yaml_reads_as_booleans_stay_text(tmp_path: Path) -> N
     for key in all_keys():
         outer, _, name = key.rpartition(".")
         properties = (section.get("properties", {}) for section in sections.values())
-        schema = next((known[name] for known in properties if name in known), {})
+        schema = next((schemas[name] for schemas in properties if name in schemas), {})
         for word in schema.get("enum", ()):
             if outer and yaml.safe_load(str(word)) != word:
                 required = ["replay.data.path=d"] * key.startswith("replay.")

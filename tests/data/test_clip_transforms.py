@@ -65,10 +65,10 @@ def test_transforms_are_identical_after_resume_and_in_workers(droid: Path) -> No
         config = parse_config(values(**data, workers=workers), where="").data
         return frames(open_dataset(config), count, start_position=start)
 
-    whole = read(12)
-    assert torch.equal(read(4, 16), whole[16:])
-    assert torch.equal(read(12, workers=2), whole)
-    assert torch.equal(read(4, 16, workers=1), whole[16:])
+    uninterrupted = read(12)
+    assert torch.equal(read(4, 16), uninterrupted[16:])
+    assert torch.equal(read(12, workers=2), uninterrupted)
+    assert torch.equal(read(4, 16, workers=1), uninterrupted[16:])
 
 
 def test_transforms_run_in_config_order_with_independent_random_numbers() -> None:

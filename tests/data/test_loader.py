@@ -201,14 +201,14 @@ def test_camera_of_a_clip_depends_on_seed_and_position_only() -> None:
 def test_camera_frame_poses_give_camera_frame_actions() -> None:
     cameras = np.tile([0.3, -0.2, 0.5, 0.4, -0.3, 1.2], (30, 1))
     source = MemorySource([30], extrinsics=lambda _: cameras)
-    in_base = clip_at(open_memory_source(source), 0, 3)
+    base_frame_clip = clip_at(open_memory_source(source), 0, 3)
     dataset = open_memory_source(source)
     dataset = replace(dataset, config=dataset.config.model_copy(update={"pose_frame": "camera"}))
     clip = clip_at(dataset, 0, 3)
     expected = states_in_camera_frame(source.read(0).states[3:8:2], cameras[3:8:2])
     np.testing.assert_allclose(clip.states, expected, atol=1e-6)
     np.testing.assert_allclose(clip.actions, actions_from_states(expected), atol=1e-6)
-    assert not np.allclose(clip.actions, in_base.actions, atol=1e-3)
+    assert not np.allclose(clip.actions, base_frame_clip.actions, atol=1e-3)
     assert np.allclose(clip.extrinsics, cameras[:3])
 
 

@@ -79,8 +79,8 @@ def test_correct_rotation_format_is_never_rejected(base: str, rotation_format: R
                 seed,
                 change,
             )
-        joined = [np.concatenate(numbers[first : first + 5]) for first in (0, 5)]
-        assert find_smoother_formats(joined, rate_hz)[rotation_format] is None, seed
+        pooled_numbers = [np.concatenate(numbers[first : first + 5]) for first in (0, 5)]
+        assert find_smoother_formats(pooled_numbers, rate_hz)[rotation_format] is None, seed
 
 
 @pytest.mark.parametrize("rotation_format", FORMATS)

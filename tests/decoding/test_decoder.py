@@ -141,11 +141,11 @@ def test_decoded_image_depends_only_on_the_latents_of_its_frame(size: str) -> No
 @pytest.mark.parametrize("size", SIZES)
 def test_decoded_images_are_independent_of_the_chunk_size(size: str) -> None:
     decoder, latents = make_decoder_of_size(size), random_latents(2, 5)
-    whole = decoder.decode(latents)
-    assert whole.shape == (2, 5, 3, 24, 24)
+    expected = decoder.decode(latents)
+    assert expected.shape == (2, 5, 3, 24, 24)
     for chunk in (1, 3, 4):
-        torch.testing.assert_close(decoder.decode(latents, chunk=chunk), whole, atol=1e-5, rtol=0)
-    torch.testing.assert_close(decoder.decode(latents[1, 3]), whole[1, 3], atol=1e-5, rtol=0)
+        torch.testing.assert_close(decoder.decode(latents, chunk=chunk), expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(decoder.decode(latents[1, 3]), expected[1, 3], atol=1e-5, rtol=0)
 
 
 def test_decoder_starts_equal_to_the_linear_decoder() -> None:

@@ -36,7 +36,7 @@ def without_dropout(make_config, tmp_path):
 
 def test_two_processes_resumed_as_one_equal_a_single_process_run(without_dropout, reporter, tmp_path) -> None:
     """One rank receives a signal, both stop after the same step, and one process resumes with all clips of a step."""
-    whole = train(without_dropout("whole", training__steps=16, training__accumulation=4), type(reporter)())
+    single_process_run = train(without_dropout("whole", training__steps=16, training__accumulation=4), type(reporter)())
     config = without_dropout("shared", training__steps=16, training__accumulation=2)
     port = free_port()
     ranks = [
@@ -57,11 +57,11 @@ def test_two_processes_resumed_as_one_equal_a_single_process_run(without_dropout
     train(config, reporter)  # resumes again with one process, and with 8 clips per step although the config now gives 4
     assert reporter.steps[0] == state.step + 2
     assert any("computes 4 micro-batches of 2" in note for note in reporter.notes)
-    assert_equal_up_to_rounding(whole, tmp_path / "shared")
+    assert_equal_up_to_rounding(single_process_run, tmp_path / "shared")
 
 
 def test_two_torchrun_nodes_equal_a_single_process_run(without_dropout, reporter, tmp_path) -> None:
-    whole = train(without_dropout("whole", training__accumulation=2), reporter)
+    single_process_run = train(without_dropout("whole", training__accumulation=2), reporter)
     without_dropout("nodes", training__accumulation=1)
     port = free_port()
     nodes = []
@@ -72,7 +72,7 @@ def test_two_torchrun_nodes_equal_a_single_process_run(without_dropout, reporter
         nodes.append(Rank(words, {**os.environ, "OMP_NUM_THREADS": "1"}))
     finish(nodes)
     assert read_state(newest_checkpoint(tmp_path / "nodes/checkpoints")).num_processes == 2
-    assert_equal_up_to_rounding(whole, tmp_path / "nodes")
+    assert_equal_up_to_rounding(single_process_run, tmp_path / "nodes")
 
 
 def test_collectives_of_a_training_step(tmp_path, without_dropout) -> None:
@@ -82,16 +82,18 @@ def test_collectives_of_a_training_step(tmp_path, without_dropout) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old_processes", "new_processes", "each"),
+    ("old_processes", "new_processes", "num_micro_batches"),
     [(1, 1, None), (1, 2, "2"), (1, 3, "1 or 2"), (2, 1, "8"), (4, 2, "8"), (2, 5, "1 or 2")],
 )
 def test_clips_of_a_step_do_not_depend_on_the_number_of_processes(
-    make_config, reporter, old_processes: int, new_processes: int, each: str | None
+    make_config, reporter, old_processes: int, new_processes: int, num_micro_batches: str | None
 ) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
     state = RunState(step=3, num_processes=old_processes, clips_per_step=8 * old_processes, clips_per_process=8)
     assert count_micro_batches(config, state, new_processes, reporter) * 2 == state.clips_per_step
-    assert [f"computes {each} micro-batches of 2" in note for note in reporter.notes] == [True] * (each is not None)
+    assert [f"computes {num_micro_batches} micro-batches of 2" in note for note in reporter.notes] == [True] * (
+        num_micro_batches is not None
+    )
 
 
 def test_more_processes_than_micro_batches_raise(make_config, reporter) -> None:

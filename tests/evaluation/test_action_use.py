@@ -55,7 +55,7 @@ def alternatives_to(
     move: Transition, moves: list[Transition], space: ActionSpace, samples: int, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the alternatives from the box, and those from the shell."""
-    largest = np.abs([each.true_action for each in moves]).max(axis=0)
+    largest = np.abs([candidate.true_action for candidate in moves]).max(axis=0)
     actions = draw_alternatives(move.true_action, largest, space, ProbeOptions(samples=samples), generator)
     return actions[:samples], actions[samples:]
 
@@ -143,8 +143,8 @@ def test_shell_alternatives_have_the_true_length_and_all_directions() -> None:
     assert np.linalg.norm(shell[:, :3], axis=1) == pytest.approx(np.full(samples, 0.07))
     assert np.abs(shell[:, :3].mean(axis=0)).max() < 0.005
     assert np.array_equal(shell[:, 3:], np.zeros((samples, 4)))
-    still = replace(move, action=torch.zeros(7))
-    assert not alternatives_to(still, [move], POSE_CHANGE, samples, np.random.default_rng(0))[1].any()
+    zero_move = replace(move, action=torch.zeros(7))
+    assert not alternatives_to(zero_move, [move], POSE_CHANGE, samples, np.random.default_rng(0))[1].any()
 
 
 def test_vector_components_are_scaled_by_their_largest_change() -> None:
@@ -160,8 +160,10 @@ def test_alternatives_of_a_move_do_not_depend_on_other_moves() -> None:
     batch = clips_of(0.02 * torch.randn(CLIPS, 4, 7, generator=torch.Generator().manual_seed(0)))
     moves = moves_of(batch)
     probes = ProbeOptions(samples=20, at_once=7)
-    of_all, of_last = (rank_actions(Halfway(), some, POSE_CHANGE, probes, seed=3) for some in (moves, moves[-2:]))
-    assert np.array_equal(of_all.ranks[-2:], of_last.ranks)
+    all_ranks, last_ranks = (
+        rank_actions(Halfway(), subset, POSE_CHANGE, probes, seed=3) for subset in (moves, moves[-2:])
+    )
+    assert np.array_equal(all_ranks.ranks[-2:], last_ranks.ranks)
 
 
 # ---- energies ----
@@ -213,7 +215,7 @@ def test_box_alternatives_change_the_position_of_poses_and_all_components_of_vec
     assert 0.07 < np.abs(box[:, :3]).max() <= 0.075
     assert abs(box[:, :3].mean()) < 0.005
     box, _ = alternatives_to(moves[0], moves, make_vector_actions(7, "change"), 500, np.random.default_rng(0))
-    assert (np.abs(box).max(axis=0) <= np.abs([move.true_action for move in moves]).max(axis=0)).all()
+    assert (np.abs(box).max(axis=0) <= np.abs([candidate.true_action for candidate in moves]).max(axis=0)).all()
     assert np.abs(box[:, 3:]).max() > 0.05
 
 

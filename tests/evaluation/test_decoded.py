@@ -81,10 +81,10 @@ def test_perfect_predictor_equals_decoded_truth_and_copying_equals_decoded_persi
 ) -> None:
     assert oracle.sources == (*BASELINES, "base", "adapter")
     for source, baseline in (("adapter", DECODED_TRUTH), ("base", DECODED_PERSISTENCE)):
-        of_model, of_baseline = values_of(oracle, source), values_of(oracle, baseline)
-        assert of_model.keys() == of_baseline.keys() >= {"psnr_db.moving.truth", "ssim.whole.decoded_truth"}
-        for metric, values in of_model.items():
-            np.testing.assert_array_equal(values, of_baseline[metric])
+        model_values, baseline_values = values_of(oracle, source), values_of(oracle, baseline)
+        assert model_values.keys() == baseline_values.keys() >= {"psnr_db.moving.truth", "ssim.whole.decoded_truth"}
+        for metric, values in model_values.items():
+            np.testing.assert_array_equal(values, baseline_values[metric])
     assert all(np.isnan(values_of(oracle, "adapter")["psnr_db.whole.decoded_truth"])), "identical images: infinite"
     assert values_of(oracle, "adapter")["ssim.whole.decoded_truth"] == pytest.approx([1.0] * (TIME - 1), abs=1e-6)
 
@@ -99,13 +99,13 @@ def test_half_motion_predictor_scores_between_persistence_and_truth() -> None:
 
 
 def test_static_clip_is_excluded_from_moving_region_metrics() -> None:
-    still = replace(BATCH, latents=BATCH.latents.clone(), actions=BATCH.actions.clone())
-    still.latents[:3] = still.latents[:3, :1]
-    decoded = measure_decoded(evaluated_models(Copier()), clips(still, TRAINED), TRAINED)
-    rest = replace(BATCH, **{
+    static = replace(BATCH, latents=BATCH.latents.clone(), actions=BATCH.actions.clone())
+    static.latents[:3] = static.latents[:3, :1]
+    decoded = measure_decoded(evaluated_models(Copier()), clips(static, TRAINED), TRAINED)
+    moving = replace(BATCH, **{
         name: getattr(BATCH, name)[3:] for name in ("latents", "actions", "states", "episode_ids", "starts")
     })  # fmt: skip
-    without = measure_decoded(evaluated_models(Copier()), clips(rest, TRAINED), TRAINED)
+    without = measure_decoded(evaluated_models(Copier()), clips(moving, TRAINED), TRAINED)
     key = ("adapter", "psnr_db.moving.truth")
     assert decoded.curves[key][0].value == pytest.approx(without.curves[key][0].value, rel=1e-5)
     assert any("3 clips are left out" in note for note in decoded.notes)

@@ -23,9 +23,9 @@ def latents(seed: int, spread: float = 1.0, tokens: int = 9, dim: int = 24) -> t
     """Return latents that are similar within an episode, with a common mean and a variance proportional to `spread`."""
     generator = torch.Generator().manual_seed(seed)
     mean = torch.linspace(-1, 1, tokens * dim).reshape(1, 1, tokens, dim)
-    of_episode = torch.randn(EPISODES, 2, tokens, dim, generator=generator).repeat(CLIPS // EPISODES, 1, 1, 1)
-    of_clip = torch.randn(CLIPS, 2, tokens, dim, generator=generator)
-    return mean + math.sqrt(spread) * (0.6 * of_episode + 0.8 * of_clip)
+    episode_part = torch.randn(EPISODES, 2, tokens, dim, generator=generator).repeat(CLIPS // EPISODES, 1, 1, 1)
+    clip_part = torch.randn(CLIPS, 2, tokens, dim, generator=generator)
+    return mean + math.sqrt(spread) * (0.6 * episode_part + 0.8 * clip_part)
 
 
 def summed(values: torch.Tensor, batch: int = 5) -> LatentSums:
@@ -103,8 +103,8 @@ MEAN = 0.2 * np.cos(np.arange(DIM))
 
 def features(rng: np.random.Generator) -> np.ndarray:
     """Return features of clips that are similar within an episode."""
-    of_episode = np.repeat(rng.standard_normal((MMD_EPISODES, DIM)), MMD_CLIPS, axis=0)
-    return MEAN + SCALES * (0.8 * of_episode + 0.6 * rng.standard_normal((len(MMD_IDS), DIM)))
+    episode_part = np.repeat(rng.standard_normal((MMD_EPISODES, DIM)), MMD_CLIPS, axis=0)
+    return MEAN + SCALES * (0.8 * episode_part + 0.6 * rng.standard_normal((len(MMD_IDS), DIM)))
 
 
 def equally_spread(rng: np.random.Generator, true: np.ndarray) -> np.ndarray:
@@ -131,7 +131,9 @@ def test_smoothed_predictions_have_a_higher_mmd_than_equally_spread_predictions(
     for seed in range(30):
         rng = np.random.default_rng(seed)
         true = features(rng)
-        values.append([mmd(each, true, MMD_IDS).value for each in (smoothed(rng, true), equally_spread(rng, true))])
+        values.append(
+            [mmd(predicted, true, MMD_IDS).value for predicted in (smoothed(rng, true), equally_spread(rng, true))]
+        )
     smooth, spread = np.mean(values, axis=0)
     assert smooth > spread + 3 * np.std(np.subtract(*np.transpose(values))) / math.sqrt(30)
 

@@ -81,7 +81,7 @@ def test_spread_and_mmd_equal_those_of_the_predicted_latents() -> None:
     batch = clips_batch()
     predicted = Halfway().rollout(batch.latents[:, :1], batch.actions, batch.states)
     latents = predicted, batch.latents[:, 1:], batch.latents[:, :1]
-    traces = [each.double().var(dim=0, correction=0).sum(dim=(1, 2)) for each in latents]
+    traces = [values.double().var(dim=0, correction=0).sum(dim=(1, 2)) for values in latents]
     models = {name: model.distribution for name, model in evaluation.models.items()}
     assert values_of(models["adapter"].spread) == pytest.approx((traces[0] / traces[1]).tolist(), rel=1e-5)
     assert values_of(models["base"].spread) == pytest.approx([1.0] * (TIME - 1))
@@ -134,7 +134,7 @@ def test_only_selected_steps_are_averaged(oracle: Evaluation) -> None:
 
 def test_same_seed_gives_equal_metrics_and_another_seed_other_alternative_actions(oracle: Evaluation) -> None:
     assert metrics_as_dict(evaluated(Oracle(), Copier())) == metrics_as_dict(oracle)
-    first, second = (each.models["adapter"].ranking for each in (oracle, evaluated(Oracle(), seed=1)))
+    first, second = (result.models["adapter"].ranking for result in (oracle, evaluated(Oracle(), seed=1)))
     assert first is not None
     assert second is not None
     assert first.change != second.change
@@ -182,14 +182,14 @@ def test_each_model_predicts_within_its_prediction_context() -> None:
         active.pop()
 
     class InContext(Copier):
-        def predict(self, *inputs, **more):  # type: ignore[no-untyped-def]
+        def predict(self, *inputs, **options):  # type: ignore[no-untyped-def]
             assert active == ["base"]
-            return super().predict(*inputs, **more)
+            return super().predict(*inputs, **options)
 
     class OutsideContext(Oracle):
-        def predict(self, *inputs, **more):  # type: ignore[no-untyped-def]
+        def predict(self, *inputs, **options):  # type: ignore[no-untyped-def]
             assert not active
-            return super().predict(*inputs, **more)
+            return super().predict(*inputs, **options)
 
     evaluated_models = [
         EvaluatedModel("base", "base", InContext(), base_context),

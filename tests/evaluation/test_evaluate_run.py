@@ -123,11 +123,11 @@ def test_a_model_is_measured_on_the_data_of_a_config_and_equals_the_base_of_a_ru
     path = write_config(config, tmp_path)
     arguments = ["evaluate", str(base_folder), "--data", path, "--out", str(tmp_path / "model"), "--clips", "5", *QUICK]
     assert main(arguments) == 0
-    of_model = read_json(tmp_path / "model")
-    assert list(of_model["models"]) == ["model"]
-    assert of_model["base"] is None
-    assert of_model["about"]["checkpoint"] == ""
-    assert rollout_ratios(of_model, "model") == pytest.approx(rollout_ratios(read_json(run), "base"), rel=1e-5)
+    model_metrics = read_json(tmp_path / "model")
+    assert list(model_metrics["models"]) == ["model"]
+    assert model_metrics["base"] is None
+    assert model_metrics["about"]["checkpoint"] == ""
+    assert rollout_ratios(model_metrics, "model") == pytest.approx(rollout_ratios(read_json(run), "base"), rel=1e-5)
 
 
 def test_other_runs_are_measured_on_the_same_latents(run: str, tmp_path: Path, base_folder: Path) -> None:
@@ -164,7 +164,7 @@ def test_run_without_base_model_is_measured_alone_or_raises_if_base_is_requested
 ) -> None:
     config = make_config(model__base="random", model__sizes=TINY_CONFIG, adapter__kind="none")
     folder, dataset = write_adapted_run(config), open_dataset(config.data)
-    assert [each.role for each in load_models(str(folder), config, make_options(), dataset).evaluated_models] == [
+    assert [model.role for model in load_models(str(folder), config, make_options(), dataset).evaluated_models] == [
         "trained"
     ]
     with pytest.raises(InputError, match=r"--against base: a model without a base"):

@@ -27,11 +27,11 @@ Imagine = Callable[..., RolloutComparison]
 
 @pytest.fixture
 def imagine(whole_run: Path, whole_decoder: Path) -> Imagine:  # noqa: F811 - the fixture
-    def of(subject: Path = whole_run, **requested: object) -> RolloutComparison:
+    def compare_rollouts(subject: Path = whole_run, **requested: object) -> RolloutComparison:
         options = {"decoder": str(whole_decoder), "steps": STEPS, **requested}
         return imagine_clip(str(subject), ImagineOptions(**options))  # type: ignore[arg-type]
 
-    return of
+    return compare_rollouts
 
 
 @pytest.fixture
@@ -54,8 +54,8 @@ def true_latents(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
     latents: list[Tensor] = []
     encode = imagined.encode_batch
 
-    def record(*values: object, **more: object) -> object:
-        batch = encode(*values, **more)  # type: ignore[arg-type]
+    def record(*values: object, **options: object) -> object:
+        batch = encode(*values, **options)  # type: ignore[arg-type]
         latents.append(batch.latents)
         return batch
 

@@ -73,9 +73,11 @@ SMALLER = Metric("height", "height", "1 / (1 + L1), with the wrong direction", L
 PROBES = ProbeOptions(ranking_clips=0, landscape_clips=0, examples=0)
 
 
-def evaluated(trained: object, base: object, *more: Metric) -> Evaluation:
+def evaluated(trained: object, base: object, *metrics: Metric) -> Evaluation:
     evaluated_models = [EvaluatedModel("base", "base", base), EvaluatedModel("adapter", "trained", trained)]  # type: ignore[arg-type]
-    return evaluate(evaluated_models, repeatable_clips(clips_batch()), about(), metrics=(L1, L2, *more), probes=PROBES)
+    return evaluate(
+        evaluated_models, repeatable_clips(clips_batch()), about(), metrics=(L1, L2, *metrics), probes=PROBES
+    )
 
 
 def test_a_third_party_metric_appears_in_rows_and_comparison(tmp_path: Path) -> None:

@@ -66,7 +66,8 @@ def model(
     name: str, level: float, *, noise: float = 0.02, shuffled: float | None = None, episodes: int = 8
 ) -> ModelResult:
     true, wrong = (
-        dict.fromkeys((L1, L2), errors(each, noise)) for each in (level, level if shuffled is None else shuffled)
+        dict.fromkeys((L1, L2), errors(error_level, noise))
+        for error_level in (level, level if shuffled is None else shuffled)
     )
     by_actions = prediction_errors(episodes, true=true, zero=wrong, shuffled=wrong)
     return ModelResult(name, "base" if name == "base" else "trained", by_actions)
@@ -80,7 +81,7 @@ def evaluation(*models: ModelResult, episodes: int = 8) -> Evaluation:
         clips=describe_clips(
             actions, list(zip(ids, range(CLIPS), strict=True)), space=POSE_CHANGE, seconds_per_step=0.5
         ),
-        models={each.name: each for each in models},
+        models={model.name: model for model in models},
     )
 
 
@@ -252,8 +253,8 @@ def with_landscape(result: ModelResult, distance: float, sharpness: float, episo
     energy = np.full((2, 2, 2), 1.0)
     energy[0, 0, 0], energy[1, 1, 1] = 1 - sharpness / 2, 1 + sharpness / 2
     maps = tuple(
-        Landscape(name, 0, np.zeros((3, 2)), energy, np.zeros(3), np.array([each, 0.0, 0.0]))
-        for name, each in zip(ids, distances, strict=True)
+        Landscape(name, 0, np.zeros((3, 2)), energy, np.zeros(3), np.array([offset, 0.0, 0.0]))
+        for name, offset in zip(ids, distances, strict=True)
     )
     return replace(result, landscapes=Landscapes(("dx", "dy", "dz"), "cm", maps, 25.0))
 
@@ -278,10 +279,10 @@ def test_a_better_landscape_needs_a_nearer_minimum_than_the_base_model_and_a_ran
     assert summary.verdicts[3] == verdict
     assert (verdict.conclusion, verdict.unit, verdict.baseline) == (conclusion, "cm", 25.0)
     assert verdict.value == pytest.approx(adapter[0], abs=0.5)
-    few = summary_of(with_landscape(model("adapter", 0.7), *adapter, episodes=1)).landscape
-    assert few is not None
-    assert few.conclusion == "inconclusive"
-    assert few.reference.endswith("; 1 episode is too few for a conclusion)")
+    single_episode = summary_of(with_landscape(model("adapter", 0.7), *adapter, episodes=1)).landscape
+    assert single_episode is not None
+    assert single_episode.conclusion == "inconclusive"
+    assert single_episode.reference.endswith("; 1 episode is too few for a conclusion)")
 
 
 def test_predictions_that_are_not_finite_have_no_conclusion() -> None:
@@ -364,8 +365,8 @@ def test_summary_fits_a_screen_and_has_complete_sentences(
     episodes: int, with_base: bool, level: float, shuffled: float, rank: float, distance: float
 ) -> None:
     models = [ranked("base", 1.0, 0.05)] * with_base + [ranked("adapter", level, rank, shuffled=shuffled, noise=0.1)]
-    models = [with_spread(each, 0.9 if each.role == "base" else 0.8) for each in models]
-    measured = evaluation(*(with_landscape(each, distance, 0.0086, episodes) for each in models), episodes=episodes)
+    models = [with_spread(result, 0.9 if result.role == "base" else 0.8) for result in models]
+    measured = evaluation(*(with_landscape(result, distance, 0.0086, episodes) for result in models), episodes=episodes)
     subject = f"runs/{'a-kitchen-with-a-name-that-is-long-enough-to-wrap-' * 2}"
     measured = replace(measured, about=replace(measured.about, subject=subject), copies=models[0].distribution)
     measured = with_errors(measured, "adapter", errors_by_metric(level, abs(2 - level)))

@@ -52,7 +52,7 @@ def wait_for_steps(page: Any, count: int) -> None:
     )
 
 
-def get_pixels(page: Any, of: str) -> str:
+def get_pixels(page: Any, name: str) -> str:
     """Return the pixels of the large image of a model or of the ground truth."""
     return str(
         page.evaluate(
@@ -62,7 +62,7 @@ def get_pixels(page: Any, of: str) -> str:
               canvas.getContext("2d").drawImage(image, 0, 0, 64, 64);
               return canvas.toDataURL();
             }""",
-            of,
+            name,
         )
     )
 
@@ -70,16 +70,16 @@ def get_pixels(page: Any, of: str) -> str:
 def test_action_changes_all_images_and_undo_restores_them(live: Views, open_page: Any) -> None:
     with serving(live) as url:
         page = open_page(url)
-        before = [get_pixels(page, of) for of in ("base", "adapter", "truth")]
+        before = [get_pixels(page, name) for name in ("base", "adapter", "truth")]
         page.get_by_role("button", name=re.compile("left$")).first.click()
         wait_for_steps(page, 1)
-        after = [get_pixels(page, of) for of in ("base", "adapter", "truth")]
+        after = [get_pixels(page, name) for name in ("base", "adapter", "truth")]
         assert all(old != new for old, new in zip(before, after, strict=True))
         assert re.search(r"error \d\.\d+.*persistence \d\.\d+", role(page, "sentence").inner_text())
         assert re.search(r"turn left \d\.\d°: ", role(page, "sentence").inner_text())
         role(page, "undo").click()
         wait_for_steps(page, 0)
-        assert [get_pixels(page, of) for of in ("base", "adapter", "truth")] == before
+        assert [get_pixels(page, name) for name in ("base", "adapter", "truth")] == before
 
 
 def test_all_functions_are_available_by_keys(live: Views, open_page: Any) -> None:

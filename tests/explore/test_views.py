@@ -22,11 +22,11 @@ GOAL = GoalFrame(0, 6)
 
 def parse_message(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     size = int.from_bytes(message[:4], "big")
-    header, rest, images = json.loads(message[4 : 4 + size]), message[4 + size :], {}
+    header, image_bytes, images = json.loads(message[4 : 4 + size]), message[4 + size :], {}
     for image in header["images"]:
         name, size = image["name"], image["bytes"]
-        images[name], rest = decode_image(rest[:size], name), rest[size:]
-    assert not rest
+        images[name], image_bytes = decode_image(image_bytes[:size], name), image_bytes[size:]
+    assert not image_bytes
     return header, images
 
 

@@ -32,8 +32,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def goals(folder: Path, out: Path, *more: str, source: str = "config.yaml") -> tuple[int, dict]:
-    status = main(["goals", str(folder / source), "--out", str(out), *more])
+def goals(folder: Path, out: Path, *options: str, source: str = "config.yaml") -> tuple[int, dict]:
+    status = main(["goals", str(folder / source), "--out", str(out), *options])
     return status, json.loads((out / "goals.json").read_text()) if status == 0 else {}
 
 
@@ -117,8 +117,8 @@ def test_invalid_goal_folder_raises_before_planning(
 def test_goals_command_with_invalid_input_prints_one_error_and_writes_nothing(
     words: list[str], wrong: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source, *more = words
-    status, _ = goals(folder, tmp_path / "goals", *more, source=source)
+    source, *options = words
+    status, _ = goals(folder, tmp_path / "goals", *options, source=source)
     assert status == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")

@@ -94,24 +94,24 @@ def test_empty_test_split_is_an_error_only_if_its_share_is_above_zero(droid: Pat
 
 
 def test_small_test_split_proposes_a_share_that_suffices(tmp_path: Path) -> None:
-    few, many = (write_vectors(tmp_path / str(episodes), width=3, episodes=episodes) for episodes in (6, 45))
+    small_set, large_set = (write_vectors(tmp_path / str(episodes), width=3, episodes=episodes) for episodes in (6, 45))
     values = {"source": "npz", "states": "vector", "validation_share": 0.1, "test_share": 0.15}
-    dataset = open_dataset(make_data_config(many, **values))
+    dataset = open_dataset(make_data_config(large_set, **values))
     tested = [dataset.table.identity(index) for index in np.flatnonzero(dataset.split_mask("test")).tolist()]
     with_small_split = make_data_config(
-        many, **values, exclude=tuple(tested[3:])
+        large_set, **values, exclude=tuple(tested[3:])
     )  # the hashes draw 3 of 38 episodes, although the share is 5.7 episodes
     texts = {}
-    for config in (make_data_config(few, **values), with_small_split):
+    for config in (make_data_config(small_set, **values), with_small_split):
         (texts[config.path],) = (
             finding.text for finding in check_data(config, clips=2) if "cannot show whether" in finding.text
         )
-    assert texts[str(few)].endswith("Record more episodes")
-    proposed = float(re.search(r"data.test_share=([\d.]+)", texts[str(many)])[1])
+    assert texts[str(small_set)].endswith("Record more episodes")
+    proposed = float(re.search(r"data.test_share=([\d.]+)", texts[str(large_set)])[1])
     members = open_dataset(with_small_split.model_copy(update={"test_share": proposed})).split_mask("test").sum()
     assert proposed > 0.15
     assert members >= 5
-    assert texts[str(many)].endswith(f"the split then has {members}")
+    assert texts[str(large_set)].endswith(f"the split then has {members}")
 
 
 def test_check_of_a_url_reports_the_bytes_fetched_per_clip(gcs: Gcs, tmp_path: Path) -> None:

@@ -77,8 +77,8 @@ def test_coverage_of_too_few_steps_is_skipped() -> None:
         assert coverage.verdict == f"needs at least 100 consecutive moving steps, found {coverage.moving_steps}"
         levels = {finding.about: finding.level for finding in coverage_findings(coverage)}
         assert levels == {"axes": "ok", "coverage": "skipped"}, "the reason is printed once"
-    still = poses(np.zeros((5, 7)))
-    assert (still.metrics["directions"], still.metrics["mean_direction"], still.low_diversity_reason) == (0, 0, "")
+    static = poses(np.zeros((5, 7)))
+    assert (static.metrics["directions"], static.metrics["mean_direction"], static.low_diversity_reason) == (0, 0, "")
 
 
 def test_changes_span_one_stride_within_selected_ranges_in_the_model_frame() -> None:
@@ -106,12 +106,12 @@ def test_vectors_whose_numbers_hardly_change_or_only_increase_have_low_diversity
 
     free = np.random.default_rng(0).normal(size=(300, 6)) * 0.1
     assert vectors(free).verdict == DIVERSE
-    held = free * [1, 1, 0, 0, 0.001, 0.001]
-    coverage = vectors(held)
+    nearly_constant = free * [1, 1, 0, 0, 0.001, 0.001]
+    coverage = vectors(nearly_constant)
     assert (coverage.metrics["both_ways"], coverage.metrics["still"]) == ([0, 1], [2, 3, 4, 5])
     assert coverage.low_diversity_reason == "4 of 6 numbers hardly change, 0 change in one direction only"
     assert vectors(np.abs(free)).low_diversity_reason == "0 of 6 numbers hardly change, 6 change in one direction only"
-    assert vectors(held, 4).low_diversity_reason == "", "75 steps"
+    assert vectors(nearly_constant, 4).low_diversity_reason == "", "75 steps"
     assert coverage.lines["numbers"] == "2 of 6 numbers increase and decrease, 4 hardly change"
 
 

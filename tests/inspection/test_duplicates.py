@@ -94,9 +94,9 @@ def test_copies_with_noise_or_rounding_are_found_and_similar_episodes_are_not(tm
     folder = tmp_path / "set"
     folder.mkdir()
     frames = np.random.default_rng(0).integers(0, 255, (STEPS, 8, 8, 3)).astype(np.uint8)
-    still = np.tile([0.4, 0, 0.4, 3, 0, 0, 0], (STEPS, 1)) + generator.normal(0, 1e-6, (3, STEPS, 7))
+    static = np.tile([0.4, 0, 0.4, 3, 0, 0, 0], (STEPS, 1)) + generator.normal(0, 1e-6, (3, STEPS, 7))
     states = {f"{number}{variant}": poses for number in range(3) for variant, poses in enumerate(near(number))}
-    for name, poses in (states | {f"still {number}": poses for number, poses in enumerate(still)}).items():
+    for name, poses in (states | {f"still {number}": poses for number, poses in enumerate(static)}).items():
         np.savez(folder / f"{name}.npz", states=poses, frames=frames, fps_hz=15.0)
     duplicates = find_duplicates(open_dataset(config_of("npz", folder, tmp_path)))
     assert (duplicates.episodes, duplicates.different, duplicates.copies) == (

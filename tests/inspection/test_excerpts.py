@@ -29,7 +29,7 @@ def recorded(seed: int = 0, episodes: int = EPISODES, steps: int = STEPS) -> lis
     return [(states, spot_frames(states)) for states in motions]
 
 
-def each(fault: Callable[[np.ndarray, np.ndarray], Pair]) -> Fault:
+def change_all(fault: Callable[[np.ndarray, np.ndarray], Pair]) -> Fault:
     return lambda pairs: [fault(states, frames) for states, frames in pairs]
 
 
@@ -48,21 +48,21 @@ def twice(values: np.ndarray) -> np.ndarray:
 
 
 FAULTS: dict[str, Fault] = {
-    "unchanged": each(lambda s, f: (s, f)),
-    "a step late": each(lambda s, f: (s[1:], f[:-1])),
-    "late": each(lambda s, f: (s[8:], f[:-8])),
-    "early": each(lambda s, f: (s[:-2], f[2:])),
-    "reversed": each(lambda s, f: (s, f[::-1])),
+    "unchanged": change_all(lambda s, f: (s, f)),
+    "a step late": change_all(lambda s, f: (s[1:], f[:-1])),
+    "late": change_all(lambda s, f: (s[8:], f[:-8])),
+    "early": change_all(lambda s, f: (s[:-2], f[2:])),
+    "reversed": change_all(lambda s, f: (s, f[::-1])),
     "half reversed": lambda pairs: [(s, f[::-1] if n % 2 else f) for n, (s, f) in enumerate(pairs)],
     "foreign": lambda pairs: [(s, pairs[(n + 1) % len(pairs)][1]) for n, (s, _) in enumerate(pairs)],
-    "stale poses": each(lambda s, f: (stale(s), f)),
-    "held poses": each(lambda s, f: (s[np.arange(len(s)) // 5 * 5], f)),
-    "deltas": each(lambda s, f: (np.diff(s, axis=0, append=s[-1:]), f)),
-    "noise": each(lambda s, f: (s, noise_like(f))),
-    "each step twice": each(lambda s, f: (twice(s), twice(f))),
-    "each frame twice": each(lambda s, f: (s, f[np.arange(len(f)) // 2 * 2])),
-    "one frame": each(lambda s, f: (s, f[np.zeros(len(f), int)])),
-    "near the base": each(lambda s, f: (s - np.append(s[0, :3], [0, 0, 0, 0]) * [1, 1, 1, 0, 0, 0, 0], f)),
+    "stale poses": change_all(lambda s, f: (stale(s), f)),
+    "held poses": change_all(lambda s, f: (s[np.arange(len(s)) // 5 * 5], f)),
+    "deltas": change_all(lambda s, f: (np.diff(s, axis=0, append=s[-1:]), f)),
+    "noise": change_all(lambda s, f: (s, noise_like(f))),
+    "each step twice": change_all(lambda s, f: (twice(s), twice(f))),
+    "each frame twice": change_all(lambda s, f: (s, f[np.arange(len(f)) // 2 * 2])),
+    "one frame": change_all(lambda s, f: (s, f[np.zeros(len(f), int)])),
+    "near the base": change_all(lambda s, f: (s - np.append(s[0, :3], [0, 0, 0, 0]) * [1, 1, 1, 0, 0, 0, 0], f)),
 }
 
 
@@ -125,10 +125,10 @@ def config_of(path: Path, tmp_path: Path, **changes: object) -> DataConfig:
 
 
 def test_check_reports_shifted_frames_and_skips_agreement_for_a_latent_cache(tmp_path: Path) -> None:
-    late = config_of(write_spots(tmp_path / "late", FAULTS["late"](recorded())), tmp_path)
-    findings = {finding.about: finding for finding in check_data(late, clips=2)}
+    config = config_of(write_spots(tmp_path / "late", FAULTS["late"](recorded())), tmp_path)
+    findings = {finding.about: finding for finding in check_data(config, clips=2)}
     assert (findings["agreement"].level, "8 steps" in findings["agreement"].text) == ("error", True)
-    cached = config_of(write_cache(open_dataset(late)), tmp_path, source="latents")
+    cached = config_of(write_cache(open_dataset(config)), tmp_path, source="latents")
     findings = {finding.about: finding for finding in check_data(cached, clips=2)}
     assert (findings["agreement"].level, "latent cache" in findings["agreement"].text) == ("skipped", True)
 

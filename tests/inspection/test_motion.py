@@ -63,7 +63,7 @@ def with_black_first_frame(number: int) -> Pair:
     return states, frames
 
 
-def joined(number: int) -> Pair:
+def join_recordings(number: int) -> Pair:
     (first_states, first_frames), (second_states, second_frames) = clean(number), clean(100 + number)
     second_states[:, 0] += 0.4
     return np.concatenate([first_states, second_states]), np.concatenate([first_frames, second_frames])
@@ -142,10 +142,10 @@ def test_single_black_frame_is_described_in_the_singular(tmp_path: Path) -> None
 
 
 def test_speed_example_is_the_step_between_joined_recordings(tmp_path: Path) -> None:
-    warnings = read_warnings(config_of(tmp_path / "set", joined))
+    warnings = read_warnings(config_of(tmp_path / "set", join_recordings))
     assert set(warnings) == {"speed"}
     assert f"step {STEPS - 1} to {STEPS}: " in warnings["speed"]
-    states = joined(0)[0]
+    states = join_recordings(0)[0]
     stretch = Stretch("e", 7, np.concatenate([states[:40], states[40:]]))
     text = check_speed([stretch], RATE_HZ, "1 of 1 episode checked").text
     jump_m = np.linalg.norm(states[40, :3] - states[39, :3])

@@ -80,7 +80,7 @@ class StepOracle:
         rotations = matrices_from_euler(states[:, 3:6]).reshape(len(states), 9)
         return np.concatenate([states[:, :3], rotations, states[:, 6:]], axis=1)
 
-    def _at(self, episode: int, step: int) -> np.ndarray:
+    def _encode_step(self, episode: int, step: int) -> np.ndarray:
         latents = self._latents[episode % EPISODES]
         return latents[step % len(latents)]
 
@@ -89,18 +89,18 @@ class StepOracle:
         assert batch.frames is not None
         self.encoded += 1
         pixels = batch.frames[:, :, 0, self._column][..., self._channels].numpy().astype(int)
-        encoded_steps = [[self._at(episode, step) for episode, step, _ in clip] for clip in pixels]
+        encoded_steps = [[self._encode_step(episode, step) for episode, step, _ in clip] for clip in pixels]
         latents = torch.from_numpy(np.array(encoded_steps)).float()[:, :, None]
         return LatentBatch(latents, batch.states, batch.actions, None, batch.episode_ids, batch.starts)
 
     def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
         """Return the pose after each action."""
         del states, extrinsics
-        after, by = latents.clone(), actions[:, :, None]
-        after[..., :3] += by[..., :3]
-        turned = torch.from_numpy(matrices_from_euler(by[..., 3:6].double().numpy())).float()
+        after, changes = latents.clone(), actions[:, :, None]
+        after[..., :3] += changes[..., :3]
+        turned = torch.from_numpy(matrices_from_euler(changes[..., 3:6].double().numpy())).float()
         after[..., ROTATION] = (turned @ after[..., ROTATION].unflatten(-1, (3, 3))).flatten(-2)
-        after[..., 12:] += by[..., 6:]
+        after[..., 12:] += changes[..., 6:]
         return after
 
     def rollout(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:

@@ -66,13 +66,13 @@ def test_probe_without_a_validation_split_uses_training_episodes(
 def test_latent_cache_is_probed_with_its_encoder_and_without_frame_variants(
     make_config: MakeConfig, tmp_path: Path, capsys: Printed
 ) -> None:
-    of_frames = make_config(data__frames=10, data__start_every=2)
-    base = str(of_frames.model.base)
-    cache = encode_for(of_frames, load_base(of_frames.model, seed=0), open_dataset(of_frames.data))
+    frame_config = make_config(data__frames=10, data__start_every=2)
+    base = str(frame_config.model.base)
+    cache = encode_for(frame_config, load_base(frame_config.model, seed=0), open_dataset(frame_config.data))
     config = make_config(
         data__source="latents", data__path=str(cache), data__camera=None, data__frames=10, data__start_every=2
     )
-    probe, expected = probed(config, base), probed(of_frames, base)
+    probe, expected = probed(config, base), probed(frame_config, base)
     assert probe.plain.ratio.value == pytest.approx(expected.plain.ratio.value, rel=2e-3)  # kept in bfloat16
     assert names(probe) == names(expected) - {"red and blue exchanged", "frames mirrored"}
     differences = {result.name: result.difference.value for result in expected.results}

@@ -36,13 +36,13 @@ def test_stable_worldmodel_solver_plans_with_this_model(tmp_path: Path) -> None:
     install(
         sys.executable, "--target", str(tmp_path / "site"), "--no-deps", "gymnasium", "loguru", "farama-notifications"
     )
-    own = make_controller()
-    own.reset(image(100))
+    controller = make_controller()
+    controller.reset(image(100))
     chunks = np.random.default_rng(0).normal(0, 0.02, (5, 2, 7))
     np.savez(tmp_path / "given.npz", image=image(0), goal=image(100), state=STATE, chunks=chunks)
     paths = os.pathsep.join([str(tmp_path / "site"), str(EXAMPLES), str(ROOT / "tests/support"), str(ROOT / "src")])
     results = run_script(sys.executable, "in_stable_worldmodel.py", tmp_path, PYTHONPATH=paths)
-    np.testing.assert_allclose(results["costs"][1], own.score(image(0), STATE, chunks).energies, rtol=1e-5)
+    np.testing.assert_allclose(results["costs"][1], controller.score(image(0), STATE, chunks).energies, rtol=1e-5)
     assert results["shape"] == [2, 5]
     assert results["is_costable"]
     assert results["solved"] < results["nothing"]

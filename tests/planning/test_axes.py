@@ -125,12 +125,12 @@ def test_run_accepts_axes_calibrated_for_its_trained_weights(make_config: Any, t
     run = write_adapted_run(config)
     loaded = load_subject(run)
     path = write_axes(tmp_path / "axes.json", loaded.world_model)
-    for_base = write_axes(tmp_path / "base.json", WorldModel.from_pretrained(str(config.model.base)))
+    base_axes = write_axes(tmp_path / "base.json", WorldModel.from_pretrained(str(config.model.base)))
     subject = load_for_planning(str(run), overrides=[f"planning.axes={path}"])
     Controller.of_subject(subject)
     Controller.of_run(loaded, config.planning.model_copy(update={"axes": path}))
     with pytest.raises(InputError, match="calibrated for another model"):
-        Controller.of_subject(load_for_planning(str(run), overrides=[f"planning.axes={for_base}"]))
+        Controller.of_subject(load_for_planning(str(run), overrides=[f"planning.axes={base_axes}"]))
 
 
 def test_calibration_output_can_be_read(tmp_path: Path) -> None:

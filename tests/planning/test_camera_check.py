@@ -30,7 +30,7 @@ def make_controller() -> Controller:
     return controller
 
 
-def why(controller: Controller, frame: np.ndarray, state: np.ndarray = STATE) -> str:
+def decide_reason(controller: Controller, frame: np.ndarray, state: np.ndarray = STATE) -> str:
     """Return the reason of a decision; check that the action is zero for a faulty frame."""
     action = controller.act(frame, state)
     assert action.any() == (controller.decision.why in {"planned", "as planned"})
@@ -62,20 +62,20 @@ def test_covered_lens_with_noise_is_a_uniform_frame(noise: float) -> None:
 def test_frozen_frame_gives_zero_actions_until_the_image_changes() -> None:
     controller = make_controller()
     reasons = [
-        why(controller, image(seed), state)
+        decide_reason(controller, image(seed), state)
         for seed, state in ((0, STATE), (0, MOVED), (0, MOVED), (1, MOVED), (1, MOVED))
     ]
     assert reasons == ["planned", "frozen frame", "frozen frame", "planned", "planned"]
-    assert why(controller, image(1), STATE) == "frozen frame"
+    assert decide_reason(controller, image(1), STATE) == "frozen frame"
     controller.reset(image(100))
-    assert why(controller, image(1), STATE) == "planned", "a reset removes the previous image"
+    assert decide_reason(controller, image(1), STATE) == "planned", "a reset removes the previous image"
 
 
 def test_reused_image_buffer_is_not_a_frozen_frame() -> None:
     controller, memory = make_controller(), image(0)
-    why(controller, memory, STATE)
+    decide_reason(controller, memory, STATE)
     memory[:] = image(1)
-    assert why(controller, memory, MOVED) == "planned"
+    assert decide_reason(controller, memory, MOVED) == "planned"
 
 
 @pytest.mark.parametrize(
@@ -95,10 +95,10 @@ def test_fault_of_one_of_two_cameras_stops_the_robot() -> None:
     controller = make_tiny_controller(views=2)
     two = lambda left, right: np.hstack([image(left, 48, 48) if left else BLACK[:48, :48], image(right, 48, 48)])  # noqa: E731
     controller.reset(two(100, 101))
-    assert why(controller, two(1, 2)) == "planned"
-    assert why(controller, two(1, 3), MOVED) == "frozen frame"
-    assert why(controller, two(4, 5), MOVED) == "planned"
-    assert why(controller, two(0, 6), MOVED) == "uniform frame"
+    assert decide_reason(controller, two(1, 2)) == "planned"
+    assert decide_reason(controller, two(1, 3), MOVED) == "frozen frame"
+    assert decide_reason(controller, two(4, 5), MOVED) == "planned"
+    assert decide_reason(controller, two(0, 6), MOVED) == "uniform frame"
     with pytest.raises(InputError, match="goal 0: an image without contrast"):
         controller.reset(two(0, 6))
 
@@ -110,8 +110,10 @@ def test_contrast_check_uses_only_the_cropped_image(crop: Crop) -> None:
     controller.reset(wide)
     edge = np.full_like(wide, 128)
     edge[:, :20] = wide[:, :20]
-    assert why(controller, edge) == ("planned" if crop == "letterbox" else "uniform frame")
-    assert why(controller, np.full_like(wide, 128)) == "uniform frame", "the bars of a letterbox are no contrast"
+    assert decide_reason(controller, edge) == ("planned" if crop == "letterbox" else "uniform frame")
+    assert decide_reason(controller, np.full_like(wide, 128)) == "uniform frame", (
+        "the bars of a letterbox are no contrast"
+    )
 
 
 def test_faulty_frame_does_not_advance_the_goal() -> None:
@@ -119,7 +121,7 @@ def test_faulty_frame_does_not_advance_the_goal() -> None:
     goals = [dataclasses.replace(goal, share=0.5) for goal in make_timed_goals([image(100), image(101)], [3])]
     goals[0] = dataclasses.replace(goals[0], at_least=1)
     controller.follow(goals)
-    assert why(controller, BLACK) == "uniform frame"
+    assert decide_reason(controller, BLACK) == "uniform frame"
     assert (controller.decision.goals, math.isnan(controller.decision.current_energy)) == ((0, 0), True)
     controller.act(image(1), STATE)
     began = controller.decision.progress.initial_energy
@@ -127,7 +129,7 @@ def test_faulty_frame_does_not_advance_the_goal() -> None:
         float((controller.encode(image(1)) - controller._goal_latents[0]).abs().mean()), rel=1e-5
     )
     for _ in range(4):
-        assert why(controller, BLACK) == "uniform frame"
+        assert decide_reason(controller, BLACK) == "uniform frame"
         assert (controller.decision.progress.goal_index, controller.decision.progress.changed) == (0, "")
     controller.act(image(2), STATE)
     assert controller.decision.progress.goal_index == 1, "the goal's steps have elapsed"

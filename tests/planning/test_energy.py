@@ -207,9 +207,9 @@ def test_energy_slice_extends_beyond_the_limits_of_fixed_components() -> None:
     np.testing.assert_allclose(
         slices[2].up, [-0.1, 0, 0.1], rtol=1e-5
     )  # dz is fixed, so its range is that of the component with the larger limit
-    held = make_pose_search_space(PlanningConfig(horizon=4, limits=LimitsConfig(xyz=(0, 0, 0), rotation=0.1)))
+    fixed_space = make_pose_search_space(PlanningConfig(horizon=4, limits=LimitsConfig(xyz=(0, 0, 0), rotation=0.1)))
     np.testing.assert_allclose(
-        compute_energy_slices(weighted, CHOSEN, held, nodes=3)[0].up, [-0.0625, 0, 0.0625], rtol=1e-5
+        compute_energy_slices(weighted, CHOSEN, fixed_space, nodes=3)[0].up, [-0.0625, 0, 0.0625], rtol=1e-5
     )
 
 

@@ -138,9 +138,9 @@ def test_gripper_mode_without_gripper_or_free_component_raises() -> None:
     controller = make_vector_controller("difference")
     with pytest.raises(InputError, match=r"'held' of a goal: .*vector states"):
         controller.follow([SubGoal(image(100), gripper="held")])
-    held = make_controller(limits=LimitsConfig(xyz=(0.0, 0.0, 0.0)))
+    controller = make_controller(limits=LimitsConfig(xyz=(0.0, 0.0, 0.0)))
     with pytest.raises(InputError, match="'held' of a goal: no free component"):
-        held.follow([SubGoal(image(100), gripper="held")])
+        controller.follow([SubGoal(image(100), gripper="held")])
 
 
 def sub_goal(*arguments: object, **options: object) -> SubGoal:
@@ -163,8 +163,8 @@ bounds = st.tuples(st.integers(1, 4), st.integers(0, 4))
 @st.composite
 def goal_sequences(draw: st.DrawFn) -> tuple[list[SubGoal], list[list[float]]]:
     """Draw the rules of some goals, and the energies of more images than the goals can use."""
-    some = draw(st.lists(st.tuples(bounds, st.none() | st.floats(0.05, 0.95)), min_size=1, max_size=4))
-    rules = [sub_goal("", low, low + more, share) for (low, more), share in some]
+    intervals = draw(st.lists(st.tuples(bounds, st.none() | st.floats(0.05, 0.95)), min_size=1, max_size=4))
+    rules = [sub_goal("", low, low + length, share) for (low, length), share in intervals]
     rules.append(sub_goal(share=draw(st.none() | st.floats(0.05, 0.95))))
     steps = sum(goal.at_most or 0 for goal in rules) + 3
     row = st.lists(numbers, min_size=len(rules), max_size=len(rules))

@@ -95,9 +95,11 @@ def test_monitor_command_detects_a_corrupted_image(
 
 
 def write_monitor(folder: Path, threshold: float) -> str:
-    known = tiny_model().fingerprints()
+    fingerprints = tiny_model().fingerprints()
     usual = (0.0,) * tiny_model().num_tokens
-    monitor = Monitor("vjepa2-ac monitor 1", threshold, 0.1, 8, (threshold,), usual, known.encoder, known.predictor)
+    monitor = Monitor(
+        "vjepa2-ac monitor 1", threshold, 0.1, 8, (threshold,), usual, fingerprints.encoder, fingerprints.predictor
+    )
     (folder / MONITOR).write_text(json.dumps(asdict(monitor)))
     return str(folder / MONITOR)
 
@@ -154,11 +156,11 @@ def test_monitor_compares_the_last_prediction_with_the_current_frame(tmp_path: P
 
 def test_monitor_of_another_model_or_without_a_threshold_raises(tmp_path: Path) -> None:
     path = write_monitor(tmp_path, 1.0)
-    known = json.loads(Path(path).read_text())
-    Path(path).write_text(json.dumps(known | {"predictor": "0" * 64}))
+    content = json.loads(Path(path).read_text())
+    Path(path).write_text(json.dumps(content | {"predictor": "0" * 64}))
     with pytest.raises(InputError, match="another model"):
         run_controller(path)
-    Path(path).write_text(json.dumps(known | {"threshold": None}))
+    Path(path).write_text(json.dumps(content | {"threshold": None}))
     with pytest.raises(InputError, match="threshold"):
         run_controller(path)
 

@@ -51,8 +51,8 @@ def test_runs_with_different_base_models_are_compared_with_persistence(tmp_path:
 
 
 def test_different_action_ranking_settings_give_no_recommendation(tmp_path: Path) -> None:
-    more = replace(PROBES, samples=12)
-    comparison = compare([written(tmp_path / "a", Halfway()), written(tmp_path / "b", Halfway(), probes=more)])
+    more_samples = replace(PROBES, samples=12)
+    comparison = compare([written(tmp_path / "a", Halfway()), written(tmp_path / "b", Halfway(), probes=more_samples)])
     assert any("measured with different settings" in note for note in comparison.notes)
     assert comparison.next_command == "No run is recommended: the actions were ranked with different settings."
     other_seed = compare([tmp_path / "a", written(tmp_path / "c", Halfway(), ranking_seed=1)])
@@ -130,17 +130,17 @@ def test_run_without_better_action_ranking_is_not_recommended(two: Comparison, c
 
 def test_too_few_episodes_give_no_recommendation_and_no_difference(two: Comparison) -> None:
     comparison = with_runs(two, a=(0.4, 0.7, 100), b=(0.3, 0.9, 200))
-    few = "1 held-out episode is too few for a conclusion; at least 5 are needed"
+    reason = "1 held-out episode is too few for a conclusion; at least 5 are needed"
     summaries = {name: run.summary for name, run in comparison.measured.items()}
     summaries = {
-        name: replace(run, prediction=replace(run.prediction, needs=f"{few}. So far: error 1 % lower."))
+        name: replace(run, prediction=replace(run.prediction, needs=f"{reason}. So far: error 1 % lower."))
         for name, run in summaries.items()
     }
     measured = {name: replace(run, summary=summaries[name]) for name, run in comparison.measured.items()}
     rows = tuple(replace(row, low=math.nan, high=math.nan) for row in comparison.rows)
     comparison = replace(comparison, measured=measured, rows=rows)
-    assert comparison.next_command == f"No run is recommended: {few}."
-    assert f"Whether the errors differ is not measured: {few}." in " ".join(str(comparison).split())
+    assert comparison.next_command == f"No run is recommended: {reason}."
+    assert f"Whether the errors differ is not measured: {reason}." in " ".join(str(comparison).split())
 
 
 @pytest.mark.parametrize(

@@ -179,11 +179,11 @@ def test_manifest_without_state_or_with_outside_paths_is_damage(tmp_path: Path, 
     older, newer = write(tmp_path / "run", 10), write(tmp_path / "run", 20)
     files = json.loads((newer / "manifest.json").read_text())["files"]
     (tmp_path / "elsewhere").write_bytes((newer / "state.json").read_bytes())
-    elsewhere = {"../../elsewhere": files["state.json"]}
+    outside_paths = {"../../elsewhere": files["state.json"]}
     for text, words in [
         (manifest_of({}), "does not name state.json"),
         (manifest_of({name: digest for name, digest in files.items() if name != "state.json"}), "does not name"),
-        (manifest_of({**files, **elsewhere}), "the path '../../elsewhere', which is outside"),
+        (manifest_of({**files, **outside_paths}), "the path '../../elsewhere', which is outside"),
         (manifest_of({**files, str(tmp_path / "elsewhere"): files["state.json"]}), "which is outside"),
         *((text, "manifest.json is damaged") for text in ("", "[]", "{}", '{"files": 3}')),
     ]:

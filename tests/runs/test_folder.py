@@ -160,23 +160,23 @@ def home(tmp_path: Path, data_folder: Path, base_folder: Path, monkeypatch: pyte
 
 
 @pytest.fixture
-def at_home(make_config, home: Path):  # type: ignore[no-untyped-def]
+def relative_config(make_config, home: Path):  # type: ignore[no-untyped-def]
     values = config_as_dict(make_config(training__steps=2, data__test_share=0.3))
     values["data"]["path"], values["model"]["base"] = "data", "base"
     return parse_config({**values, "run_dir": "run"}, where=str(home))
 
 
-def test_only_missing_paths_are_resolved_from_the_folder_of_the_start(at_home, home, monkeypatch) -> None:
+def test_only_missing_paths_are_resolved_from_the_folder_of_the_start(relative_config, home, monkeypatch) -> None:
     (home / "caches").mkdir()
     (home / "ranges.json").write_text("{}")
-    elsewhere = home.parent / "elsewhere"
-    (elsewhere / "data").mkdir()
-    values = config_as_dict(at_home)
+    other_folder = home.parent / "elsewhere"
+    (other_folder / "data").mkdir()
+    values = config_as_dict(relative_config)
     values["data"] |= {"cache_dir": "caches", "disk_cache": {"dir": "none"}}
     values["data"]["idle"] |= {"rule": "published", "ranges": "ranges.json"}
     (home / "run").mkdir()
     (home / "run/environment.json").write_text(json.dumps([{"folder": str(home)}]))
-    monkeypatch.chdir(elsewhere)
+    monkeypatch.chdir(other_folder)
 
     def read_data_config(**changes: object):  # type: ignore[no-untyped-def]
         data = {key: value for key, value in values["data"].items() if key != "fields" or "source" not in changes}
@@ -213,8 +213,8 @@ LINES = [
 
 def test_remote_locations_of_a_config_are_listed_with_their_keys() -> None:
     assert list_remote_locations(parse_config(ELSEWHERE, where="")) == LINES
-    here = {"run_dir": "r", "data": {"path": "d", "exclude": ["gs://is-but-a-name"]}, "model": {"base": "b.pt"}}
-    assert list_remote_locations(parse_config(here, where="")) == []
+    values = {"run_dir": "r", "data": {"path": "d", "exclude": ["gs://is-but-a-name"]}, "model": {"base": "b.pt"}}
+    assert list_remote_locations(parse_config(values, where="")) == []
 
 
 def test_remote_locations_of_a_run_are_printed_before_they_are_used(
@@ -284,10 +284,10 @@ def test_folder_is_locked_before_remote_access_and_not_by_a_check(
 
     monkeypatch.setattr(OPEN_REMOTE, remote)
     with open_run(config, reporter, check_only=check_only):
-        (into,) = targets
-        assert (into is not None) == check_only
-        assert into is None or folder not in into.parents
-    assert into is None or not into.parent.exists()
+        (target,) = targets
+        assert (target is not None) == check_only
+        assert target is None or folder not in target.parents
+    assert target is None or not target.parent.exists()
 
 
 def test_next_start_uses_the_calibrated_stride(make_config, reporter) -> None:

@@ -15,11 +15,15 @@ MESSAGE_WITH_GOALS = {**MESSAGE, "goal/images": GOALS}
 
 def test_droid_roboarena_and_generic_messages_are_parsed_equally() -> None:
     pose = {"observation/cartesian_position": STATE[:6], "observation/gripper_position": STATE[6:]}
-    others = {"observation/joint_position": np.zeros(7), "observation/wrist_image_left": image(9), "client": "theirs"}
+    ignored_keys = {
+        "observation/joint_position": np.zeros(7),
+        "observation/wrist_image_left": image(9),
+        "client": "theirs",
+    }
     for message in (
         MESSAGE,
-        {"observation/exterior_image_1_left": image(0), **pose, **others},
-        {"observation/exterior_image_0_left": image(0), **pose, **others, "endpoint": "infer", "session_id": "a"},
+        {"observation/exterior_image_1_left": image(0), **pose, **ignored_keys},
+        {"observation/exterior_image_0_left": image(0), **pose, **ignored_keys, "endpoint": "infer", "session_id": "a"},
         {"observation/image": image(0), "observation/state": STATE.tolist()},
         {"observation/image": image(0), **pose, "observation/gripper_position": float(STATE[6])},
     ):
@@ -73,7 +77,7 @@ def test_goal_fingerprint_is_equal_only_for_equal_goals() -> None:
     first = fingerprint(goal_image=image(1))
     assert fingerprint(goal_image=image(1).copy()) == first
     mask = np.ones((48, 60), dtype=np.uint8)
-    others = [
+    other_fingerprints = [
         fingerprint(goal_image=image(2)),
         fingerprint(goal_image=image(1), goal_mask=mask),
         fingerprint(goal_images=GOALS),
@@ -81,7 +85,7 @@ def test_goal_fingerprint_is_equal_only_for_equal_goals() -> None:
         fingerprint(goal_image=image(1).reshape(60, 48, 3)),
         fingerprint(goal_name="1"),
     ]
-    assert len({first, *others}) == 7
+    assert len({first, *other_fingerprints}) == 7
 
 
 def test_reset_or_new_session_id_starts_an_episode() -> None:

@@ -140,14 +140,14 @@ class _ExpiringClock:
 
 def test_deadline_returns_the_zero_action_and_does_not_change_the_next_decision() -> None:
     controller = make_controller()
-    late = Session(controller, None, SessionOptions(deadline_s=2.5), clock=_ExpiringClock(2))
-    reply = ask(late, **request(0, goal_image=image(100)))
+    expired_session = Session(controller, None, SessionOptions(deadline_s=2.5), clock=_ExpiringClock(2))
+    reply = ask(expired_session, **request(0, goal_image=image(100)))
     assert reply["why"] == "past the deadline"
     assert not reply["actions"].any()
     assert reply["actions"].shape == (2, 7)
-    late._clock = lambda: 0.0
+    expired_session._clock = lambda: 0.0
     np.testing.assert_array_equal(
-        ask(late, **request(0))["actions"], ask(session(), **request(0, goal_image=image(100)))["actions"]
+        ask(expired_session, **request(0))["actions"], ask(session(), **request(0, goal_image=image(100)))["actions"]
     )
 
 
@@ -392,9 +392,9 @@ def test_cancelled_score_stops_after_the_current_batch(ended_by: str, monkeypatc
     batch_sizes: list[int] = []
     rollout = served.controller._model.rollout
 
-    def record_batch(frame: torch.Tensor, *more: object, **options: object) -> object:
+    def record_batch(frame: torch.Tensor, *arguments: object, **options: object) -> object:
         batch_sizes.append(len(frame))
-        return rollout(frame, *more, **options)
+        return rollout(frame, *arguments, **options)
 
     monkeypatch.setattr(served.controller._model, "rollout", record_batch)
     message = pack(request(1, **SCORE))

@@ -30,8 +30,8 @@ VALUES = st.recursive(PLAIN | ARRAYS, lambda inner: st.lists(inner, max_size=4),
 MESSAGES = st.dictionaries(st.text(max_size=10), VALUES, max_size=6)
 
 
-def array_of(dtype: object = "<f4", shape: object = (2,), data: object = b"\0" * 8, **more: object) -> bytes:
-    return msgpack.packb({"a": {b"__ndarray__": True, b"data": data, b"dtype": dtype, b"shape": shape, **more}})
+def array_of(dtype: object = "<f4", shape: object = (2,), data: object = b"\0" * 8, **fields: object) -> bytes:
+    return msgpack.packb({"a": {b"__ndarray__": True, b"data": data, b"dtype": dtype, b"shape": shape, **fields}})
 
 
 @given(MESSAGES)

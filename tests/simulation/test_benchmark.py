@@ -108,8 +108,8 @@ def test_non_finite_model_returns_zero_actions_and_exits_with_status_1(
     out = tmp_path / "out"
     assert main(["simulate", str(tmp_path / "broken"), *TWICE, "--films", "0", "--out", str(out), *SMALL]) == 1
     assert "broken: 4 of 4 decisions: no finite energy" in capsys.readouterr().out
-    steered, nothing = (metrics(out)["policies"][name]["by_episode"] for name in ("broken", "zero action"))
-    assert steered["distance_cm"] == nothing["distance_cm"]
+    broken_model, zero_action = (metrics(out)["policies"][name]["by_episode"] for name in ("broken", "zero action"))
+    assert broken_model["distance_cm"] == zero_action["distance_cm"]
 
 
 @pytest.mark.parametrize(
@@ -140,8 +140,8 @@ def test_sub_goals_come_from_a_demonstration_of_the_same_problem(model: str, tmp
     arguments = ["simulate", model, "--task", "reach", "--episodes", "1", "--steps", "4", "--films", "0", *SMALL]
     runs = {}
     goal_options = {name: ["--sub-goals", name] for name in ("demonstration", "every-step")}
-    for name, more in {"single": [], **goal_options}.items():
-        assert main([*arguments, *more, "--out", str(tmp_path / name)]) == 0
+    for name, options in {"single": [], **goal_options}.items():
+        assert main([*arguments, *options, "--out", str(tmp_path / name)]) == 0
         runs[name] = metrics(tmp_path / name)
     assert [run["about"]["sub_goals"] for run in runs.values()] == ["none", *goal_options]
     distances = [run["policies"]["tiny"]["by_episode"]["distance_cm"] for run in runs.values()]

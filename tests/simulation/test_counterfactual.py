@@ -131,7 +131,7 @@ def test_resimulating_a_changed_recording_raises(recorded, tmp_path: Path) -> No
 
 
 @pytest.fixture
-def film_of(base_folder: Path, whole_decoder: Path, make_config: MakeConfig, tmp_path: Path):  # noqa: F811
+def compare_rollouts(base_folder: Path, whole_decoder: Path, make_config: MakeConfig, tmp_path: Path):  # noqa: F811
     def film(data: Path, *actions: str) -> RolloutComparison:
         config = make_config(data__path=str(data), data__validation_share=0.0, data__test_share=0.5)
         evaluation = EvaluationOptions(data=config, out=tmp_path)
@@ -141,8 +141,8 @@ def film_of(base_folder: Path, whole_decoder: Path, make_config: MakeConfig, tmp
     return film
 
 
-def test_imagine_shows_simulated_truth_for_simulated_data(simulated: Path, film_of) -> None:
-    comparison = film_of(simulated, "true", "none", "up")
+def test_imagine_shows_simulated_truth_for_simulated_data(simulated: Path, compare_rollouts) -> None:
+    comparison = compare_rollouts(simulated, "true", "none", "up")
     truths = {rollout.name: rollout.truth for rollout in comparison.rollouts}
     np.testing.assert_array_equal(truths[AS_RECORDED], comparison.truth)
     for truth in truths.values():
@@ -154,9 +154,9 @@ def test_imagine_shows_simulated_truth_for_simulated_data(simulated: Path, film_
     assert {rollout.name for rollout in comparison.rollouts if rollout.outlines is not None} == {"none", "up"}
 
 
-def test_failed_resimulation_gives_a_note(simulated: Path, film_of, tmp_path: Path) -> None:
+def test_failed_resimulation_gives_a_note(simulated: Path, compare_rollouts, tmp_path: Path) -> None:
     data = shutil.copytree(simulated, tmp_path / "data")
     (data / SIMULATION_FILE).write_text("{}")
-    comparison = film_of(data, "up")
+    comparison = compare_rollouts(data, "up")
     assert comparison.notes[-1].startswith("The true outcome of other actions was not simulated: ")
     assert [rollout.truth for rollout in comparison.rollouts] == [None]

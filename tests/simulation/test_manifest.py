@@ -13,8 +13,8 @@ SETTINGS = ["planning.samples=6", "planning.iterations=2", "planning.planner.opt
 PROBLEMS = ["--task", "push", "--domain", "B", "--episodes", "2", "--steps", "2", "--seed", "5"]
 
 
-def simulate(model: str, manifest: Path, out: Path, *more: str) -> int:
-    return main(["simulate", model, "--manifest", str(manifest), "--films", "0", "--out", str(out), *more])
+def simulate(model: str, manifest: Path, out: Path, *options: str) -> int:
+    return main(["simulate", model, "--manifest", str(manifest), "--films", "0", "--out", str(out), *options])
 
 
 def results_without_times(folder: Path) -> dict[str, Any]:

@@ -68,10 +68,10 @@ def test_same_seed_gives_same_bytes_with_any_number_of_workers(
 
 def test_single_camera_image_is_repeated_and_three_cameras_differ() -> None:
     shared = record_episode(0, RecordingSpec(DOMAIN_A, 2, 0))
-    own = record_episode(0, RecordingSpec(DOMAIN_A, 2, 0, cameras=3))
+    three_cameras = record_episode(0, RecordingSpec(DOMAIN_A, 2, 0, cameras=3))
     assert len({tuple(images) for images in shared.images.values()}) == 1
-    assert len({tuple(images) for images in own.images.values()}) == 3
-    assert own.images["exterior_image_1_left"] == shared.images["exterior_image_1_left"]
+    assert len({tuple(images) for images in three_cameras.images.values()}) == 3
+    assert three_cameras.images["exterior_image_1_left"] == shared.images["exterior_image_1_left"]
 
 
 def test_invalid_recording_options_raise_and_write_nothing(tmp_path: Path) -> None:
@@ -113,8 +113,8 @@ def test_measured_states_follow_commands_repeated_for_a_model_step() -> None:
     for first in (0, 4):
         np.testing.assert_array_equal(motion.commanded_joints[first : first + 4], motion.commanded_joints[[first] * 4])
     assert (motion.commanded_joints[4] != motion.commanded_joints[3]).any()
-    to_go = [np.abs(motion.commanded_joints[0] - motion.joints[step]).max() for step in range(4)]
-    assert to_go[0] > to_go[1] > to_go[2] > to_go[3]
+    remaining = [np.abs(motion.commanded_joints[0] - motion.joints[step]).max() for step in range(4)]
+    assert remaining[0] > remaining[1] > remaining[2] > remaining[3]
 
 
 # The file that says how a data set was simulated
@@ -151,9 +151,12 @@ def test_episode_of_another_recording_raises(tmp_path: Path) -> None:
     simulation = read_simulation(written(tmp_path, RecordingSpec("A", 5)))
     name = record_name(RecordingSpec("A", 5), 1)
     assert simulation.number_of(name) == 1
-    others = [record_name(RecordingSpec("A", 5), 2), record_name(RecordingSpec("A", 5, seed=1), 1)]
-    others += [record_name(RecordingSpec("B", 5), 1), "/nfs/AUTOLab/success/2023-07-07/Fri_Jul__7_09:42:23_2023/x.h5"]
-    for other in others:
+    other_names = [record_name(RecordingSpec("A", 5), 2), record_name(RecordingSpec("A", 5, seed=1), 1)]
+    other_names += [
+        record_name(RecordingSpec("B", 5), 1),
+        "/nfs/AUTOLab/success/2023-07-07/Fri_Jul__7_09:42:23_2023/x.h5",
+    ]
+    for other in other_names:
         with pytest.raises(InputError, match="an unknown episode"):
             simulation.number_of(other)
 

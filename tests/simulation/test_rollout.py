@@ -137,8 +137,8 @@ def test_invalid_action_raises(arm: SimulatedArm) -> None:
 def test_unreachable_command_moves_the_arm_partially_and_is_counted(arm: SimulatedArm) -> None:
     script = Scripted(make_action(0.0, 0.0, 1.6), make_action(0.0, 0.0, 0.05))
     result = run_trial(ArmEnvironment(arm), script, trial_of(1, steps=2, stride=30))
-    risen = result.states[:, 2] - result.states[0, 2]
-    assert 0.15 < risen[1] < 1.0
+    height_change = result.states[:, 2] - result.states[0, 2]
+    assert 0.15 < height_change[1] < 1.0
     np.testing.assert_allclose(result.states[1, :2], result.states[0, :2], atol=2e-3)
     assert 1 <= result.unreachable <= 2
     assert run_trial(ArmEnvironment(arm), Scripted(make_action(0.0, 0.0, 0.05)), trial_of(1, 1)).unreachable == 0
@@ -186,10 +186,10 @@ def test_success_is_measured_at_the_end_and_success_ever_separately() -> None:
     assert metrics["final_distance_cm"].low < 10.0 < metrics["final_distance_cm"].high
     assert result.why_counts == {"planned": 3, "out of time": 3}
     assert result.unreachable.tolist() == [0, 0, 2]
-    late = (fake(0.2, 0.04, 0.1, 0.03, 0.02), fake(0.2, 0.1, 0.04, 0.04, 0.04), fake(0.2, 0.01, 0.2, 0.2, 0.2))
-    assert [episode.steps_needed for episode in late] == [3, 2, None], "until it is done for good"
+    reached_late = (fake(0.2, 0.04, 0.1, 0.03, 0.02), fake(0.2, 0.1, 0.04, 0.04, 0.04), fake(0.2, 0.01, 0.2, 0.2, 0.2))
+    assert [episode.steps_needed for episode in reached_late] == [3, 2, None], "until it is done for good"
     assert fake(0.01, 0.02).steps_needed == 0
-    assert replace(result, episodes=late).estimates["steps_needed"].value == 2.5
+    assert replace(result, episodes=reached_late).estimates["steps_needed"].value == 2.5
 
 
 def test_long_actions_are_scaled_to_the_limits_without_fixed_axes() -> None:

@@ -67,12 +67,12 @@ def test_problems_equal_those_of_earlier_versions(task: str, goal: list, block_g
 
 def test_place_succeeds_if_block_is_released_on_the_mark() -> None:
     problem = make_problem("place", DOMAIN_A, 0, 0)
-    beside, held, open_hand = np.array([0.03, 0.0, 0.0, 1.0]), problem.goal.copy(), problem.goal
-    held[6] = HOLDING
+    beside, held_goal, open_hand = np.array([0.03, 0.0, 0.0, 1.0]), problem.goal.copy(), problem.goal
+    held_goal[6] = HOLDING
     assert problem.succeeded(open_hand, problem.block_goal)
     assert problem.succeeded(open_hand, problem.block_goal + beside)
     assert not problem.succeeded(open_hand, problem.block_goal + 1.4 * beside)
-    assert not problem.succeeded(held, problem.block_goal)
+    assert not problem.succeeded(held_goal, problem.block_goal)
     for height, lies in ((0.005, True), (0.015, False)):
         assert problem.succeeded(open_hand, problem.block_goal + height * np.eye(4)[2]) == lies
     assert not problem.succeeded(open_hand, problem.block_start)

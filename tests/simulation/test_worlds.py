@@ -52,11 +52,11 @@ def test_policies_act_on_problems_that_the_expert_solves(
     assert (results["about"]["seeds"], results["about"]["left_out"]) == ([0, 2, 3], [1])
     assert list(results["policies"]) == ["tiny", "zero action", "random", "expert"]
     assert results["policies"]["expert"]["success"]["value"] == 1.0
-    still = np.array(results["policies"]["zero action"]["by_episode"]["distance_cm"])
-    assert (still == still[:, :1]).all()
-    moved = np.array(results["policies"]["tiny"]["by_episode"]["distance_cm"])
-    np.testing.assert_array_equal(moved[:, 0], still[:, 0])
-    assert (np.abs(np.diff(moved, axis=1)) > 0.01).any()
+    zero_action = np.array(results["policies"]["zero action"]["by_episode"]["distance_cm"])
+    assert (zero_action == zero_action[:, :1]).all()
+    model_distances = np.array(results["policies"]["tiny"]["by_episode"]["distance_cm"])
+    np.testing.assert_array_equal(model_distances[:, 0], zero_action[:, 0])
+    assert (np.abs(np.diff(model_distances, axis=1)) > 0.01).any()
     assert {path.name for path in tmp_path.iterdir()} == {CLOSED_LOOP_FILE, "closed_loop.mp4"}
 
 
@@ -143,20 +143,20 @@ def test_installed_environment_is_solved_by_its_expert(name: str, tmp_path: Path
     task = {"robosuite": ["Lift"], "libero": ["libero_object", "--near"], "metaworld": ["reach-v3"]}[name]
     words = shlex.join([str(python), str(ROOT / "examples" / "worlds" / f"{name}.py"), *task])
     with ExternalEnvironment(words) as world:
-        elsewhere, far = world.reset(seed=3, options={"stride": 4})
+        other_start, far = world.reset(seed=3, options={"stride": 4})
     with ExternalEnvironment(words) as world:
         for _ in range(2):
             first, info = world.reset(seed=3, options={"stride": 4})
-            np.testing.assert_array_equal(first.image, elsewhere.image)
-            np.testing.assert_array_equal(first.state, elsewhere.state)
+            np.testing.assert_array_equal(first.image, other_start.image)
+            np.testing.assert_array_equal(first.state, other_start.state)
             assert info == far
         assert first.image.shape == (256, 256, 3)
         assert first.image.std() > 10
         assert record_world(world, tmp_path, range(1)) == (1, 1)
-        for stride, up_m, least, most in ((4, 0.0, -0.02, 0.02), (15, 0.05, 0.03, 0.07)):
+        for stride, up_m, min_change, max_change in ((4, 0.0, -0.02, 0.02), (15, 0.05, 0.03, 0.07)):
             before, _ = world.reset(seed=0, options={"stride": stride})
             after, *_ = world.step(up_m * np.eye(7)[2])
-            assert least < after.state[2] - before.state[2] < most, "targets are metres in the base frame"
+            assert min_change < after.state[2] - before.state[2] < max_change, "targets are metres in the base frame"
 
 
 PIXELS = base64.b64encode(bytes(18)).decode()

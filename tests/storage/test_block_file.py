@@ -138,8 +138,8 @@ def test_entry_is_readable_by_each_cache_of_the_folder(tmp_path: Path) -> None:
         assert other.read("gs://a/b 0-10") == b"second"
         assert other.read("gs://a/b 0-11") is None
     [path] = entries(tmp_path)
-    whole = path.read_bytes()
-    for damaged in (b"", whole[:-1], b"S" + whole[1:], bytes(len(whole))):
+    content = path.read_bytes()
+    for damaged in (b"", content[:-1], b"S" + content[1:], bytes(len(content))):
         path.write_bytes(damaged)
         assert cache.read("gs://a/b 0-10") is None, "such as after a power failure"
 

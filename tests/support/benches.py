@@ -19,7 +19,7 @@ def load(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Any]]:
     monkeypatch.delitem(sys.modules, "planning", raising=False)  # a folder of tests has the same name
     yield import_module
     torch.set_num_threads(threads)
-    own = {path.stem for path in (ROOT / "benchmarks").glob("*.py")} | {"src", "notebooks"}
+    local_modules = {path.stem for path in (ROOT / "benchmarks").glob("*.py")} | {"src", "notebooks"}
     for module in set(sys.modules) - before:
-        if module.split(".")[0] in own:
+        if module.split(".")[0] in local_modules:
             del sys.modules[module]

@@ -51,9 +51,9 @@ ABOUT = About(
 
 def errors(rng: np.random.Generator, level: float, horizon: int, episode_of: np.ndarray) -> np.ndarray:
     """Return errors about a level that grow with the horizon and are alike within an episode."""
-    of_episode = 1 + 0.1 * rng.standard_normal(episode_of.max() + 1)[episode_of][:, None]
+    episode_factor = 1 + 0.1 * rng.standard_normal(episode_of.max() + 1)[episode_of][:, None]
     grown = np.linspace(1.0, 1.15, horizon)[None]
-    return 0.35 * level * of_episode * grown * (1 + 0.04 * rng.standard_normal((len(episode_of), horizon)))
+    return 0.35 * level * episode_factor * grown * (1 + 0.04 * rng.standard_normal((len(episode_of), horizon)))
 
 
 def _predicted(

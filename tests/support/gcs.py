@@ -190,8 +190,8 @@ class _Handler(RequestHandler):
     def _answer(self) -> None:
         gcs, connection = self._gcs, self.rfile
         body = connection.read(int(self.headers.get("Content-Length", 0)))
-        named = re.search(rb'"name": *"([^"]*)"', body[:1000]) if self.path.startswith("/upload/") else None
-        target = f"{self.command} {unquote(self.path)}" + (f" {named[1].decode()}" if named else "")
+        name_match = re.search(rb'"name": *"([^"]*)"', body[:1000]) if self.path.startswith("/upload/") else None
+        target = f"{self.command} {unquote(self.path)}" + (f" {name_match[1].decode()}" if name_match else "")
         gcs._count(1)
         try:
             gcs._wait_for_others(target)

@@ -28,4 +28,4 @@ def commands_of(text: str) -> list[str]:
 def shorter(command: str) -> list[str]:
     """Return additional options for a command, with which it takes only seconds."""
     words = command.removeprefix("vjepa2-ac ")
-    return next((less.split() for start, less in SHORTER.items() if f"{words} ".startswith(f"{start} ")), [])
+    return next((options.split() for start, options in SHORTER.items() if f"{words} ".startswith(f"{start} ")), [])

@@ -88,10 +88,10 @@ def write_v30(
     root = Path(folder)
     rows: list[dict[str, Any]] = []
     for file, first in enumerate(range(0, len(episodes), 2)):
-        some = range(first, min(first + 2, len(episodes)))
-        table = pa.concat_tables([_rows(episodes, number, pictures) for number in some])
+        numbers = range(first, min(first + 2, len(episodes)))
+        table = pa.concat_tables([_rows(episodes, number, pictures) for number in numbers])
         _write_table(root / _DATA_V30.format(chunk_index=0, file_index=file), table)
-        rows += [{"data/chunk_index": 0, "data/file_index": file} for _ in some]
+        rows += [{"data/chunk_index": 0, "data/file_index": file} for _ in numbers]
     if pictures == "video":
         for key in episodes[0].frames:
             _write_shared_videos(root, key, episodes, rows, episodes_per_video, gop)
@@ -180,8 +180,8 @@ def _write_shared_videos(
     root: Path, key: str, episodes: Sequence[Recorded], rows: list[dict[str, Any]], together: int, gop: int
 ) -> None:
     for first in range(0, len(episodes), together):
-        some, frames = range(first, min(first + together, len(episodes))), []
-        for number in some:
+        numbers, frames = range(first, min(first + together, len(episodes))), []
+        for number in numbers:
             start = len(frames)
             frames += episodes[number].frames[key]
             name = f"videos/{key}"

@@ -29,8 +29,8 @@ from vjepa2_ac.training.step import Run, compute_gradients, training_step
 
 
 def batches(run: Run, read: list[list[int]]) -> Iterator[Batch]:
-    whole = training_loader(run.dataset, seed=0, batch_size=2)
-    return iter([some_clips(next(whole), chosen) for chosen in read])
+    loader = training_loader(run.dataset, seed=0, batch_size=2)
+    return iter([some_clips(next(loader), chosen) for chosen in read])
 
 
 def gradient_of(run: Run, read: list[list[int]]) -> tuple[object, list[torch.Tensor]]:
@@ -90,10 +90,12 @@ def main() -> None:
     assert (resumed.state.step, resumed.state.clips_done, resumed.state.run_id) == (1, 8, run.state.run_id)
     for before, after in zip(run.world_model.parameters(), resumed.world_model.parameters(), strict=True):
         assert torch.equal(before, after)
-    moments, expected_moments = resumed.optimizer.state_dict()["state"], run.optimizer.state_dict()["state"]
-    assert moments.keys() == expected_moments.keys() != set()
+    optimizer_state, expected_state = resumed.optimizer.state_dict()["state"], run.optimizer.state_dict()["state"]
+    assert optimizer_state.keys() == expected_state.keys() != set()
     assert all(
-        torch.equal(value, moments[key][name]) for key, own in expected_moments.items() for name, value in own.items()
+        torch.equal(value, optimizer_state[key][name])
+        for key, expected_values in expected_state.items()
+        for name, value in expected_values.items()
     )
     assert not Path(f"{config.run_dir}-elsewhere").exists()
     accelerator.end_training()

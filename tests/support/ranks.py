@@ -61,11 +61,11 @@ class Rank:
         return out, err
 
 
-def start_rank(words: list[str], rank: int, processes: int, port: int, **more: str) -> Rank:
+def start_rank(words: list[str], rank: int, processes: int, port: int, **variables: str) -> Rank:
     """Start one process of a run, as srun does; `more` are additional environment variables."""
     rank_variables = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": processes, "LOCAL_WORLD_SIZE": processes}
     environment = {**os.environ, **{name: str(value) for name, value in rank_variables.items()}, "OMP_NUM_THREADS": "1"}
-    environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), **more}
+    environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), **variables}
     return Rank(words, environment)
 
 

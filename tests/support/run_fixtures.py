@@ -142,8 +142,8 @@ def popen() -> Iterator[Popen]:
     """
     with ExitStack() as ending:
 
-        def start(*arguments: Any, **named: Any) -> subprocess.Popen[Any]:
-            process = ending.enter_context(subprocess.Popen(*arguments, **named))
+        def start(*arguments: Any, **options: Any) -> subprocess.Popen[Any]:
+            process = ending.enter_context(subprocess.Popen(*arguments, **options))
             ending.callback(process.kill)
             return process
 

@@ -25,9 +25,9 @@ def session(options: SessionOptions | None = None, goals: dict | None = None, **
     return Session(make_controller(**changes), goals, options)
 
 
-def request(seed: int = 0, **more: object) -> dict:
+def request(seed: int = 0, **fields: object) -> dict:
     """Return a request; `goal_image` is the key goal/image."""
-    keys = {key.replace("goal_", "goal/"): value for key, value in more.items()}
+    keys = {key.replace("goal_", "goal/"): value for key, value in fields.items()}
     return {"observation/image": image(seed), "observation/state": STATE} | keys
 
 

@@ -55,9 +55,9 @@ def actions(samples: int, steps: int, seed: int = 5) -> Tensor:
     return 0.05 * draw(samples, steps, 7, seed=seed)
 
 
-def goal(goals: int = 1, **more: object) -> Goal:
+def goal(goals: int = 1, **options: object) -> Goal:
     """Return goals with random latents."""
-    return Goal(torch.nn.functional.layer_norm(draw(goals, TOKENS, DIM, seed=6), (DIM,)), **more)  # type: ignore[arg-type]
+    return Goal(torch.nn.functional.layer_norm(draw(goals, TOKENS, DIM, seed=6), (DIM,)), **options)  # type: ignore[arg-type]
 
 
 def cost(model: WorldModel, **settings: object) -> WorldModelCost:

@@ -172,7 +172,7 @@ def test_allowed_changes_of_the_optimizer_take_effect(make_config, reporter) -> 
     train(make_config(training__steps=2, training__weight_decay=0.04), reporter)
     run = set_up(make_config(training__weight_decay=0.5), reporter)
     assert [group["weight_decay"] for group in run.optimizer.param_groups] == [0.5]
-    assert all(moments["step"] == 2 for moments in run.optimizer.state_dict()["state"].values())
+    assert all(parameter_state["step"] == 2 for parameter_state in run.optimizer.state_dict()["state"].values())
 
 
 def test_run_resumes_with_moved_data_and_refuses_other_data(make_config, reporter, tmp_path, data_folder) -> None:

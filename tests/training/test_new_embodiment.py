@@ -70,12 +70,14 @@ def test_new_robot_from_recordings_to_a_trained_model(
 
 
 def test_resume_with_new_heads_is_bit_exact(make_robot: MakeConfig, reporter: Any, tmp_path: Path) -> None:
-    whole, stopped = ({"run_dir": str(tmp_path / name), "training__steps": 4} for name in ("whole", "stopped"))
-    train(make_robot(**whole), type(reporter)())
+    full_options, stopped_options = (
+        {"run_dir": str(tmp_path / name), "training__steps": 4} for name in ("whole", "stopped")
+    )
+    train(make_robot(**full_options), type(reporter)())
 
     with pytest.raises(KilledError):
-        train(make_robot(**stopped), dying_reporter(type(reporter)(), 3))
-    train(make_robot(**stopped), reporter)
+        train(make_robot(**stopped_options), dying_reporter(type(reporter)(), 3))
+    train(make_robot(**stopped_options), reporter)
     assert any(note.startswith("Resuming from") for note in reporter.notes)
     assert_same_run(tmp_path / "whole", tmp_path / "stopped")
 

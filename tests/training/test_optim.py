@@ -105,9 +105,9 @@ def take_steps(module: torch.nn.Linear, optimizer: torch.optim.Optimizer, seeds:
 def test_moments_of_another_optimizer_raise(changes: dict[str, Any], make_config, reporter) -> None:
     config = make_config(training__steps=1)
     checkpoint = newest_checkpoint(train(config, reporter) / "checkpoints")
-    moments = read_torch(checkpoint / "optimizer.pt") | changes
+    optimizer_state = read_torch(checkpoint / "optimizer.pt") | changes
     with (checkpoint / "optimizer.pt").open("wb") as file:
-        write_torch(moments if changes else [3], file)
+        write_torch(optimizer_state if changes else [3], file)
     write_manifest(checkpoint)
     with pytest.raises(InputError, match="not the state of this run"):
         train(make_config(training__steps=2), reporter, allow_config_change=True)

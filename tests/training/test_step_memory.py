@@ -106,9 +106,9 @@ def test_memory_of_all_blocks_follows_from_two_and_three(monkeypatch: pytest.Mon
     inferred = measure_step(config, sizes)
     monkeypatch.setattr(cost_step, "_BLOCKS", (5, 5))
     cost_step._measured.clear()
-    whole = measure_step(config, sizes)
+    measured_bytes = measure_step(config, sizes)
     cost_step._measured.clear()
-    assert inferred == pytest.approx(whole, rel=0.005)  # the step of the peak may change with depth
+    assert inferred == pytest.approx(measured_bytes, rel=0.005)  # the step of the peak may change with depth
 
 
 @pytest.mark.parametrize(("changes", "has_copies"), [({}, False), (FLOAT32_BASE, True)])

@@ -95,14 +95,14 @@ def test_lowest_ranking_error_is_selected_while_the_rollout_error_decreases(
 
 
 def test_resume_after_saving_the_base_is_exact(make_config, reporter, tmp_path, monkeypatch) -> None:
-    whole = train(make_config(run_dir=str(tmp_path / "whole")), reporter)
+    full_run = train(make_config(run_dir=str(tmp_path / "whole")), reporter)
     interrupted_config = make_config(run_dir=str(tmp_path / "halted"))
     monkeypatch.setattr(loop, "_optimize", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         train(interrupted_config, reporter)
     monkeypatch.undo()
     assert read_state(newest_checkpoint(tmp_path / "halted/checkpoints")).step == 0
-    assert_same_run(whole, train(interrupted_config, reporter))
+    assert_same_run(full_run, train(interrupted_config, reporter))
 
 
 def test_run_without_improvement_ends_after_patience(make_config, reporter, set_validation_errors) -> None:

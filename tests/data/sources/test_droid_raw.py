@@ -102,10 +102,10 @@ def test_steps_without_operator_are_dropped_with_their_frames(tmp_path: Path) ->
 
 
 def test_extrinsics_belong_to_the_selected_camera(tmp_path: Path) -> None:
-    still, moving = np.tile(np.arange(6.0), (STEPS, 1)), np.arange(STEPS * 6.0).reshape(STEPS, 6)
-    write(tmp_path, extrinsics={LEFT: still, WRIST: moving})
+    static, moving = np.tile(np.arange(6.0), (STEPS, 1)), np.arange(STEPS * 6.0).reshape(STEPS, 6)
+    write(tmp_path, extrinsics={LEFT: static, WRIST: moving})
     np.testing.assert_array_equal(source(tmp_path, camera="wrist").read(0).extrinsics, moving)
-    np.testing.assert_array_equal(source(tmp_path).read(0).extrinsics, still)
+    np.testing.assert_array_equal(source(tmp_path).read(0).extrinsics, static)
     assert source(tmp_path, camera="right").read(0).extrinsics is None
     with pytest.raises(InputError, match="pose_frame"):
         source(tmp_path, camera="right", pose_frame="camera").infos()

@@ -182,8 +182,10 @@ def test_later_clip_reads_images_from_the_cache(
 
 def write_data_set(folder: Path, state: np.ndarray, **columns: np.ndarray) -> Path:
     frames = {"observation.images.front": [np.zeros((*SIZE, 3), np.uint8)] * len(state)}
-    named = {"observation.state": state} | {name.replace("__", "."): values for name, values in columns.items()}
-    return write_v30(folder, [Recorded(named, frames)])
+    columns_by_key = {"observation.state": state} | {
+        name.replace("__", "."): values for name, values in columns.items()
+    }
+    return write_v30(folder, [Recorded(columns_by_key, frames)])
 
 
 OWN_FIELDS = {"state": ["observation.state"], "cameras": {"front": "observation.images.front"}}

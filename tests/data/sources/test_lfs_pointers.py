@@ -53,8 +53,8 @@ def test_lfs_pointer_raises_when_the_data_set_is_opened(data_format: str, patter
     folder = replace_by_pointers(DATA_FORMATS[data_format](tmp_path / "set", range(3)), pattern)
     with pytest.raises(InputError, match=r"a git-lfs pointer.*`git lfs pull`") as raised:
         open_dataset(config_of(data_format, folder, tmp_path / "cache"))
-    where = raised.value.where.split(": ")[0]
-    assert Path(where).read_bytes() == POINTER
+    path = raised.value.where.split(": ")[0]
+    assert Path(path).read_bytes() == POINTER
 
 
 @pytest.mark.parametrize(("data_format", "pattern"), [("rlds", "*.tfrecord-*"), ("lerobot", "*.mp4"), ("npz", "*.npz")])

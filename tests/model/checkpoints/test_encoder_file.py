@@ -275,19 +275,19 @@ def test_encoder_of_a_model_has_the_same_fingerprint_with_a_new_predictor() -> N
 
 
 def test_layer_option_returns_the_features_after_that_block(golden: Golden, tmp_path: Path) -> None:
-    whole, frames = model_of(golden.path), golden.io["frames.96"]
-    depth, outputs = whole.sizes.encoder.depth, list[Tensor]()
+    full_model, frames = model_of(golden.path), golden.io["frames.96"]
+    depth, outputs = full_model.sizes.encoder.depth, list[Tensor]()
     layer = 2 * depth // 3
-    hook = whole.loaded_encoder.vit.layer[layer - 1].register_forward_hook(
+    hook = full_model.loaded_encoder.vit.layer[layer - 1].register_forward_hook(
         lambda _, __, out: outputs.append(out[0] if isinstance(out, tuple) else out)
     )
-    whole.encode(frames[None])
+    full_model.encode(frames[None])
     hook.remove()
     expected = torch.nn.functional.layer_norm(outputs[0], outputs[0].shape[-1:], eps=1e-6)
     truncated = model_of(golden.path, layer=layer)
     assert len(truncated.loaded_encoder.vit.layer) == truncated.sizes.encoder.depth == layer < depth
     assert_equal_to_rounding(truncated.encode(frames[None])[0], expected)
-    assert truncated.encoder_fingerprint() != whole.encoder_fingerprint()
+    assert truncated.encoder_fingerprint() != full_model.encoder_fingerprint()
     truncated.save_pretrained(tmp_path / "cut")
     loaded = load_base(ModelConfig(base=str(tmp_path / "cut"), dtype="float32"), seed=0)
     torch.testing.assert_close(loaded.encode(frames[None]), truncated.encode(frames[None]), rtol=0, atol=0)
@@ -296,6 +296,6 @@ def test_layer_option_returns_the_features_after_that_block(golden: Golden, tmp_
         from_folder.encode(frames[None]), model_of(golden.path, layer=layer - 1).encode(frames[None]), rtol=0, atol=0
     )
     last = model_of(golden.path, layer=depth)
-    torch.testing.assert_close(last.encode(frames[None]), whole.encode(frames[None]), rtol=0, atol=0)
+    torch.testing.assert_close(last.encode(frames[None]), full_model.encode(frames[None]), rtol=0, atol=0)
     with pytest.raises(InputError, match=rf"model.encoder.layer: {depth + 1}, .* at most {depth}"):
         model_of(golden.path, layer=depth + 1)
