@@ -28,7 +28,7 @@ settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCh
 settings.load_profile("busy")
 
 import gcs as gcs_server  # noqa: E402 - the hook comes first
-from data_fixtures import droid, spoiled  # noqa: E402, F401 - fixtures for every folder
+from data_fixtures import droid, write_with_changed_record  # noqa: E402, F401 - fixtures for every folder
 from paths import ROOT  # noqa: E402
 from run_fixtures import (  # noqa: E402, F401
     base_folder,

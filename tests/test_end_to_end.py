@@ -76,7 +76,7 @@ WRONG = {
     "a folder without --resume": (["train", "{here}/lora"], "--resume"),
     "resume of no run": (["train", "{here}", "--resume"], "no config.yaml"),
     "resume with overrides": (["train", "{here}/lora", "--resume", "seed=3"], "differs in seed"),
-    "evaluate no run": (["evaluate", "{here}"], "no config.yaml"),
+    "evaluate no run": (["evaluate", "{here}"], "a folder without config.yaml"),
     "no data": (["train", "{here}/lora.yaml", "run_dir={here}/x", "data.path={here}/nowhere"], "nowhere"),
     "clips longer than episodes": (["train", "{here}/lora.yaml", "run_dir={here}/x", "data.frames=16"], "61"),
     "no test episodes": (["train", "{here}/lora.yaml", "run_dir={here}/x", "data.validation_share=0.0"], "validation"),

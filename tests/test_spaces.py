@@ -29,10 +29,10 @@ def test_rotations_are_composed_and_vectors_subtract() -> None:
 
 
 def test_implausible_state_raises_with_step_and_fix() -> None:
-    spoiled = STATES.copy()
-    spoiled[1, 1] = 400.0
+    implausible = STATES.copy()
+    implausible[1, 1] = 400.0
     with pytest.raises(InputError, match=r"a\.h5: step 1: .*millimetres.*Check the fields"):
-        POSE.require_plausible(spoiled, "a.h5", fix="Check the fields")
+        POSE.require_plausible(implausible, "a.h5", fix="Check the fields")
     POSE.require_plausible(STATES, "a.h5")
 
 

@@ -103,8 +103,8 @@ def test_experimental_condition_is_trained_and_measured(small: Any, method: str)
     row = small.tables._row(method, "20", [compact])
     assert row.count("|") == small.tables.HEAD.count("|") + 2
     if method == "zero-shot":
-        ends = {name: policy["ends_cm"][0] for name, policy in compact["baselines"].items()}
-        assert ends["oracle"] < 1 < ends["zero action"]
+        distances_cm = {name: policy["ends_cm"][0] for name, policy in compact["baselines"].items()}
+        assert distances_cm["oracle"] < 1 < distances_cm["zero action"]
 
 
 def test_runs_of_the_selection_study_differ_and_the_plots_are_drawn(evidence: Any, stored: Any, tmp_path: Path) -> None:
@@ -126,11 +126,11 @@ def test_labs_differ_and_a_third_has_a_special_condition(evidence: Any) -> None:
 def test_advice_table_counts_helpful_and_harmful_adaptation(evidence: Any) -> None:
     tables, methods = evidence.labs_tables, evidence.labs.METHODS
 
-    def trained(ends: float, *, selected: int, conclusion: str) -> dict[str, Any]:
+    def trained(distances_cm: float, *, selected: int, conclusion: str) -> dict[str, Any]:
         name = "newest" if selected == 400 else "selected"
         verdicts = {"newest": {"verdicts": {"better action ranking": {"conclusion": conclusion}}}}
         verdicts[name] = verdicts["newest"]
-        loops = {"newest": [ends] * 20}
+        loops = {"newest": [distances_cm] * 20}
         return {"selected": f"step-{selected:08d}", "evaluation": verdicts, "closed_loop": loops}
 
     base = {"closed_loop": {"newest": [1.0] * 10 + [9.0] * 10}}  # 50 %

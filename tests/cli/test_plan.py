@@ -166,15 +166,15 @@ def test_decoder_adds_predicted_frames_to_the_image_and_does_not_change_the_plan
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     decoder = write_decoder(tmp_path / "decoder", tiny_model())
-    drawn = []
+    figures = []
     monkeypatch.setattr(
-        "vjepa2_ac.reports.planning_figures.plot_plan", lambda _, path, imagined: drawn.append(imagined) or path
+        "vjepa2_ac.reports.planning_figures.plot_plan", lambda _, path, imagined: figures.append(imagined) or path
     )
     _, plain = plan(folder, *QUICK)
     status, file = plan(folder, *QUICK, "--decoder", str(decoder))
     assert status < 2
-    assert drawn[0] is None
-    assert list(drawn[1].steps) == [1]
+    assert figures[0] is None
+    assert list(figures[1].steps) == [1]
     assert file["decoder"] == {"name": str(decoder), "encoder": tiny_model().encoder_fingerprint()}
     assert file["actions"] == plain["actions"]
     assert plain["decoder"] is None

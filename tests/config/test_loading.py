@@ -76,10 +76,10 @@ def test_overrides_set_nested_keys_and_accept_scientific_notation(tmp_path: Path
     assert config.data.fields.gripper_open == 0.5
 
 
-@pytest.mark.parametrize("written", ["22008760", '"22008760"'])
-def test_camera_serial_number_is_read_as_text_with_and_without_quotes(tmp_path: Path, written: str) -> None:
+@pytest.mark.parametrize("literal", ["22008760", '"22008760"'])
+def test_camera_serial_number_is_read_as_text_with_and_without_quotes(tmp_path: Path, literal: str) -> None:
     path = write(tmp_path, yaml.safe_dump(MINIMAL))
-    for camera in (f"data.camera={written}", f"data.camera=[{written}]"):
+    for camera in (f"data.camera={literal}", f"data.camera=[{literal}]"):
         assert load_config(path, ["data.source=droid_raw", camera]).data.cameras == ("22008760",)
 
 

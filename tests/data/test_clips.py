@@ -72,12 +72,12 @@ def test_default_collate_returns_a_batch() -> None:
 
 @pytest.mark.parametrize("policy", ["error", "skip"])
 def test_broken_episode_error_names_the_episode_and_a_working_fix(
-    spoiled: Callable[[Callable[[Any], None]], Path], policy: str
+    write_with_changed_record: Callable[[Callable[[Any], None]], Path], policy: str
 ) -> None:
-    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
+    def change_features(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
 
-    clips = open_set(spoiled(spoil), broken_episodes=policy, validation_share=0.0).clips()
+    clips = open_set(write_with_changed_record(change_features), broken_episodes=policy, validation_share=0.0).clips()
     reasons = []
     for index in range(len(clips)):
         try:

@@ -67,9 +67,9 @@ def test_converted_poses_equal_the_originals(droid: Path, tmp_path: Path) -> Non
             assert mean_difference(*frames) < 3
     table = parquet.read_table(tmp_path / "out/data/chunk-000/file-000.parquet")
     actions = np.array(table["action"].to_pylist())
-    ends = np.cumsum(before.table.num_steps) - 1
-    assert not actions[ends].any(), "nothing follows the last step of an episode"
-    np.testing.assert_allclose(actions[: ends[0]], actions_from_states(before.source.read(0).states), atol=1e-6)
+    last_steps = np.cumsum(before.table.num_steps) - 1
+    assert not actions[last_steps].any(), "nothing follows the last step of an episode"
+    np.testing.assert_allclose(actions[: last_steps[0]], actions_from_states(before.source.read(0).states), atol=1e-6)
 
 
 def test_converted_video_has_one_frame_per_step(tmp_path: Path) -> None:
@@ -194,21 +194,27 @@ def test_conversion_writes_idle_steps_and_omits_excluded_episodes(droid: Path, t
 # Data sets that cannot be written.
 
 
-def damaged(spoiled: Callable[..., Path]) -> Path:
-    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
+def damaged(write_with_changed_record: Callable[..., Path]) -> Path:
+    def change_features(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/wrist_image_left"][1][9] = b"GIF89a"  # after other frames were written
 
-    return spoiled(spoil)
+    return write_with_changed_record(change_features)
 
 
-def test_broken_episode_stops_the_conversion_and_leaves_no_folder(spoiled: Callable[..., Path], tmp_path: Path) -> None:
+def test_broken_episode_stops_the_conversion_and_leaves_no_folder(
+    write_with_changed_record: Callable[..., Path], tmp_path: Path
+) -> None:
     with pytest.raises(InputError, match=r"not a JPEG.*add to data\.exclude"):
-        convert_to_lerobot(config_of(damaged(spoiled), camera=list(CAMERAS)), tmp_path / "out", SILENT)
+        convert_to_lerobot(
+            config_of(damaged(write_with_changed_record), camera=list(CAMERAS)), tmp_path / "out", SILENT
+        )
     assert not (tmp_path / "out").exists()
 
 
-def test_broken_episode_is_skipped_by_the_skip_policy(spoiled: Callable[..., Path], tmp_path: Path) -> None:
-    config = config_of(damaged(spoiled), camera=list(CAMERAS), broken_episodes="skip")
+def test_broken_episode_is_skipped_by_the_skip_policy(
+    write_with_changed_record: Callable[..., Path], tmp_path: Path
+) -> None:
+    config = config_of(damaged(write_with_changed_record), camera=list(CAMERAS), broken_episodes="skip")
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (5, 75)
     after = read_back(tmp_path / "out", *CAMERAS)
     assert after.table.num_steps.tolist() == LENGTHS[1:]

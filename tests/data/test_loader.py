@@ -80,11 +80,13 @@ def test_validation_clips_are_distinct_and_cover_all_held_out_episodes(droid: Pa
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_worker_error_reaches_the_caller_unchanged(spoiled: Callable[..., Path], workers: int) -> None:
-    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
+def test_worker_error_reaches_the_caller_unchanged(
+    write_with_changed_record: Callable[..., Path], workers: int
+) -> None:
+    def change_features(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
 
-    config = config_of(spoiled(spoil), workers=workers, validation_share=0.0)
+    config = config_of(write_with_changed_record(change_features), workers=workers, validation_share=0.0)
     with pytest.raises(InputError, match="not a JPEG") as caught:
         load_batches(60, config)
     assert type(caught.value) is InputError
@@ -254,12 +256,13 @@ def test_validation_with_only_broken_clips_raises() -> None:
         list(validation_batches(unreadable, "validation", clips=1, batch_size=1))
 
 
-def test_workers_and_resume_are_bit_exact_with_all_options(spoiled: Callable[..., Path]) -> None:
-    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
+def test_workers_and_resume_are_bit_exact_with_all_options(write_with_changed_record: Callable[..., Path]) -> None:
+    def change_features(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][3] = b"GIF89a"
 
     config = config_of(
-        spoiled(spoil), validation_share=0.0, broken_episodes="skip", camera=CAMERAS, crop="letterbox",
+        write_with_changed_record(change_features),
+        validation_share=0.0, broken_episodes="skip", camera=CAMERAS, crop="letterbox",
         idle={"rule": "motion", "shortest_kept_steps": 2, "cut_last_steps": 6},
     )  # fmt: skip
     in_this_process = load_batches(40, config)

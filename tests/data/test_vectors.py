@@ -76,9 +76,9 @@ def test_rlds_reads_the_configured_features(droid: Path) -> None:
 
 
 def test_rlds_vector_width_is_unknown_without_a_flag_per_step(
-    spoiled: Callable[[Callable[[Any], None]], Path],
+    write_with_changed_record: Callable[[Callable[[Any], None]], Path],
 ) -> None:
-    folder = spoiled(lambda features: features.pop("steps/is_first"))
+    folder = write_with_changed_record(lambda features: features.pop("steps/is_first"))
     with pytest.raises(InputError, match="steps/is_first"):
         open_dataset(vector_config(folder, source="rlds", fields={"state": JOINTS}))
 

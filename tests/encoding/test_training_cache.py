@@ -28,9 +28,9 @@ def cache_config(folder: Path, **changes: Any) -> dict[str, Any]:
 def test_training_on_a_lossless_cache_equals_on_the_fly_encoding_bit_for_bit(make_config, reporter, tmp_path) -> None:
     changes = {"data__camera": ("exterior_1_left", "wrist_left"), "data__start_every": 2, "training__steps": 3}
     changes |= {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches")}
-    on_the_fly = make_config(run_dir=str(tmp_path / "fly"), **changes)
-    train(on_the_fly, reporter)
-    folder = encode(on_the_fly)
+    uncached = make_config(run_dir=str(tmp_path / "fly"), **changes)
+    train(uncached, reporter)
+    folder = encode(uncached)
     train(make_config(run_dir=str(tmp_path / "cached"), **(changes | cache_config(folder))), reporter)
     assert_same_run(tmp_path / "fly", tmp_path / "cached")
     train(make_config(run_dir=str(tmp_path / "required"), **(changes | {"data__cache": "require"})), reporter)

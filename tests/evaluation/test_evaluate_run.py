@@ -108,12 +108,12 @@ def test_metrics_do_not_depend_on_the_batch_size(config: Config, run: str, tmp_p
         measure(run, make_options(out=tmp_path / "b"))
     finally:
         path.write_text(before)
-    by_three, by_two = read_json(run), read_json(tmp_path / "b")
+    three_at_once, two_at_once = read_json(run), read_json(tmp_path / "b")
     for name in ("base", "adapter"):
-        assert rollout_ratios(by_three, name) == pytest.approx(rollout_ratios(by_two, name), rel=1e-5)
-        ranks = [metrics["models"][name]["ranking"]["ranks"] for metrics in (by_three, by_two)]
+        assert rollout_ratios(three_at_once, name) == pytest.approx(rollout_ratios(two_at_once, name), rel=1e-5)
+        ranks = [metrics["models"][name]["ranking"]["ranks"] for metrics in (three_at_once, two_at_once)]
         assert ranks[0] == ranks[1]
-    assert by_three["clips"] == by_two["clips"]
+    assert three_at_once["clips"] == two_at_once["clips"]
 
 
 @pytest.mark.usefixtures("measured")

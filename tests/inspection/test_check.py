@@ -87,9 +87,11 @@ def test_check_of_a_data_set_reports_index_batch_and_timing(droid: Path) -> None
 
 
 def test_empty_test_split_is_an_error_only_if_its_share_is_above_zero(droid: Path) -> None:
-    in_one_group = {"split_by": "(episode|.)"}
+    one_group_values = {"split_by": "(episode|.)"}
     for share, level in ((0.001, "error"), (0.0, "skipped")):
-        findings = check_data(make_data_config(droid, test_share=share, validation_share=0.0, **in_one_group), clips=2)
+        findings = check_data(
+            make_data_config(droid, test_share=share, validation_share=0.0, **one_group_values), clips=2
+        )
         assert {finding.about: finding.level for finding in findings}["test"] == level
 
 

@@ -158,13 +158,15 @@ def with_one_outlier(number: int) -> Pair:
     return states, frames
 
 
-@pytest.mark.parametrize("in_sample", [200, 1])
+@pytest.mark.parametrize("num_sampled", [200, 1])
 def test_single_impossible_position_in_one_episode_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_sample: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_sampled: int
 ) -> None:
-    monkeypatch.setattr(motion, "_EPISODES", in_sample)
+    monkeypatch.setattr(motion, "_EPISODES", num_sampled)
     config = config_of(tmp_path / "set", with_one_outlier)
-    assert (open_dataset(config).table.find("004") in select_sample(open_dataset(config), in_sample)) == (in_sample > 1)
+    assert (open_dataset(config).table.find("004") in select_sample(open_dataset(config), num_sampled)) == (
+        num_sampled > 1
+    )
     for text in (
         read_warnings(config)["speed"],
         *(item.text for item in warnings_from_index(open_dataset(config))),
@@ -172,7 +174,7 @@ def test_single_impossible_position_in_one_episode_is_reported(
         assert ": 2 control steps in 1 episode (" in text
         assert "Example: 004, step " in text
         assert re.search(r"step (6 to 7|7 to 8): \d\d\.\d m/s", text)
-    assert ("6 by the index" in read_warnings(config)["speed"]) == (in_sample == 1)
+    assert ("6 by the index" in read_warnings(config)["speed"]) == (num_sampled == 1)
     assert not warnings_from_index(open_dataset(config_of(tmp_path / "clean", clean)))
 
 
@@ -205,11 +207,16 @@ def test_episodes_at_another_scale_are_counted(tmp_path: Path) -> None:
         r"6 episodes, such as 0(0|1)\d, have positions and motions (1.9|2.0)\d times as large", warning.text
     )
     assert findings_of(half)["scale"] == warning
-    for name, make in {"clean": clean, "one": scaled(0.5, [3]), "moved": moved_in_x, "any size": of_any_size}.items():
+    for name, make in {
+        "clean": clean,
+        "one": scaled(0.5, [3]),
+        "moved": moved_in_x,
+        "any size": scale_by_number,
+    }.items():
         assert findings_of(config_of(tmp_path / name, make, episodes=12))["scale"].level == "ok", name
 
 
-def of_any_size(number: int) -> Pair:
+def scale_by_number(number: int) -> Pair:
     """Return the motion of episodes that differ in scale, but not in two groups."""
     return scaled(0.3 * (1 / 0.3) ** (number / 11), range(12))(number)
 

@@ -18,14 +18,14 @@ MakeConfig = Callable[..., Config]
 Printed = pytest.CaptureFixture[str]
 
 
-def written(config: Config, tmp_path: Path) -> str:
+def write_config(config: Config, tmp_path: Path) -> str:
     path = tmp_path / "config.yaml"
     path.write_text(config_as_yaml(config))
     return str(path)
 
 
 def check(config: Config, tmp_path: Path, model: str) -> int:
-    return main(["data", "check", written(config, tmp_path), "--limit", "4", "--model", model])
+    return main(["data", "check", write_config(config, tmp_path), "--limit", "4", "--model", model])
 
 
 def probed(config: Config, model: str, clips: int = 4) -> VariantProbe:

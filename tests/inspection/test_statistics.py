@@ -63,8 +63,8 @@ def test_statistics_of_a_data_set_equal_values_computed_by_hand(droid: Path) -> 
     assert [values["splits"][name]["windows"] for name in ("train", "validation", "test")] == [
         *(len(dataset.windows(split)) for split in ("train", "validation")), 0,
     ]  # fmt: skip
-    by_hand = np.concatenate([dataset.source.read(index).states for index in range(6)])
-    assert inspection.ranges[6].tolist() == pytest.approx([by_hand[:, 6].min(), by_hand[:, 6].max()])
+    expected_states = np.concatenate([dataset.source.read(index).states for index in range(6)])
+    assert inspection.ranges[6].tolist() == pytest.approx([expected_states[:, 6].min(), expected_states[:, 6].max()])
 
 
 def hundred_episodes(broken: frozenset[int], policy: str) -> Dataset:

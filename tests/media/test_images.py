@@ -103,7 +103,9 @@ def test_all_data_formats_reject_images_above_the_limit(
         frames = np.zeros((3, 32, 64, 3), np.uint8)
         np.savez(path / "one.npz", states=np.zeros((3, 7)), frames=frames, fps_hz=15.0)
     else:
-        write_v30(path, [recorded(0, 3, size=(32, 64))], pictures="video" if data_format == "lerobot videos" else "png")
+        write_v30(
+            path, [recorded(0, 3, size=(32, 64))], image_format="video" if data_format == "lerobot videos" else "png"
+        )
     source = open_source(DataConfig(source=data_format.split(maxsplit=1)[0], path=str(path)))
     source.infos()
     read = source.read(0).read_frames

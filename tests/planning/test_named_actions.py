@@ -21,11 +21,11 @@ def test_opposite_named_actions_sum_to_zero_and_move_along_one_axis(name: str, o
     moves, opposite_moves = make_named_actions(name, 3), make_named_actions(opposite_name, 3)
     assert moves.any()
     assert not (moves + opposite_moves).any()
-    ends = [integrate_states(START, actions)[-1] for actions in (moves, opposite_moves)]
+    last_states = [integrate_states(START, actions)[-1] for actions in (moves, opposite_moves)]
     axis = {"up": 2, "left": 1, "forward": 0, "close": 6}[name]
-    assert ends[0][axis] > START[axis] > ends[1][axis]
+    assert last_states[0][axis] > START[axis] > last_states[1][axis]
     same = np.arange(7) != axis
-    np.testing.assert_allclose(ends[0][same], START[same], atol=1e-9)
+    np.testing.assert_allclose(last_states[0][same], START[same], atol=1e-9)
 
 
 def test_named_actions_have_the_requested_length_within_the_limits() -> None:

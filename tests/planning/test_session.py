@@ -205,8 +205,8 @@ def test_pose_run_records_data_limits_and_plans_within_them(make_config, reporte
     assert (np.abs(action[:3]) <= recorded["changes"][:3]).all()
 
     data_changes = PlanningConfig.model_validate({**PLANNING, "limits": {"xyz": "data"}})
-    of_run = Controller.of_run(load_subject(folder), data_changes)
-    np.testing.assert_allclose(of_run.space.upper[0, :3], limits, rtol=1e-6)
+    run_controller = Controller.of_run(load_subject(folder), data_changes)
+    np.testing.assert_allclose(run_controller.space.upper[0, :3], limits, rtol=1e-6)
     options = EvaluationOptions(overrides=("planning.limits.xyz=data",))
     assert resolve_config(str(folder), options).planning.limits.xyz == limits
 

@@ -17,24 +17,26 @@ from vjepa2_ac.spaces import actions_from_states, apply_action, make_vector_stat
 def random_walks(seed: int, steps: int = 12) -> np.ndarray:
     """Return the states after each control step of three chunks; the gripper stays within its limits."""
     rng = np.random.default_rng(seed)
-    walks = []
+    trajectories = []
     for _ in range(3):
         state, states = STATE, []
         for step in rng.normal(0, [0.01] * 3 + [0.1] * 3 + [0.02], (steps, 7)):
             state = apply_action(state, step)
             states.append(state)
-        walks.append(states)
-    return np.array(walks)
+        trajectories.append(states)
+    return np.array(trajectories)
 
 
 @settings(max_examples=15)
 @given(st.integers(0, 30), st.sampled_from([1, 3, 4]))
 def test_every_chunk_form_gives_the_same_changes(seed: int, control_steps: int) -> None:
     targets = random_walks(seed)
-    deltas = np.stack([actions_from_states(np.concatenate([STATE[None], walk])) for walk in targets])
-    offsets = np.array([[actions_from_states(np.stack([STATE, state]))[0] for state in walk] for walk in targets])
-    ends = targets[:, control_steps - 1 :: control_steps]
-    expected = [actions_from_states(np.concatenate([STATE[None], walk])) for walk in ends]
+    deltas = np.stack([actions_from_states(np.concatenate([STATE[None], trajectory])) for trajectory in targets])
+    offsets = np.array(
+        [[actions_from_states(np.stack([STATE, state]))[0] for state in trajectory] for trajectory in targets]
+    )
+    chunk_ends = targets[:, control_steps - 1 :: control_steps]
+    expected = [actions_from_states(np.concatenate([STATE[None], trajectory])) for trajectory in chunk_ends]
     for form, chunks in (("targets", targets), ("deltas", deltas), ("offsets", offsets)):
         changes = changes_of_chunks(chunks, STATE, form=form, control_steps=control_steps)
         np.testing.assert_allclose(changes, expected, atol=1e-9)

@@ -20,7 +20,7 @@ from worlds import Copier, Halfway, Oracle, about, clips_batch, repeatable_clips
 PROBES = ProbeOptions(ranking_clips=4, samples=10, landscape_clips=2, nodes=3, examples=0)
 
 
-def written(
+def write_evaluation(
     folder: Path,
     model: object,
     *,
@@ -41,26 +41,32 @@ def written(
 
 
 def test_runs_with_different_base_models_are_compared_with_persistence(tmp_path: Path) -> None:
-    folders = [written(tmp_path / name, Oracle(), base=base) for name, base in (("a", Copier()), ("b", Halfway()))]
+    folders = [
+        write_evaluation(tmp_path / name, Oracle(), base=base) for name, base in (("a", Copier()), ("b", Halfway()))
+    ]
     comparison = compare(folders)
     assert any("different base models" in note for note in comparison.notes)
     assert "base model" not in str(comparison).splitlines()[2]
-    same = compare([folders[0], written(tmp_path / "c", Halfway())])
+    same = compare([folders[0], write_evaluation(tmp_path / "c", Halfway())])
     assert not same.notes
     assert "base model" in str(same).splitlines()[2]
 
 
 def test_different_action_ranking_settings_give_no_recommendation(tmp_path: Path) -> None:
     more_samples = replace(PROBES, samples=12)
-    comparison = compare([written(tmp_path / "a", Halfway()), written(tmp_path / "b", Halfway(), probes=more_samples)])
+    comparison = compare(
+        [write_evaluation(tmp_path / "a", Halfway()), write_evaluation(tmp_path / "b", Halfway(), probes=more_samples)]
+    )
     assert any("measured with different settings" in note for note in comparison.notes)
     assert comparison.next_command == "No run is recommended: the actions were ranked with different settings."
-    other_seed = compare([tmp_path / "a", written(tmp_path / "c", Halfway(), ranking_seed=1)])
+    other_seed = compare([tmp_path / "a", write_evaluation(tmp_path / "c", Halfway(), ranking_seed=1)])
     assert not other_seed.notes
 
 
 def test_gain_over_the_first_run_is_paired_by_clip(tmp_path: Path) -> None:
-    comparison = compare([written(tmp_path / "half", Halfway()), written(tmp_path / "nothing", Copier())])
+    comparison = compare(
+        [write_evaluation(tmp_path / "half", Halfway()), write_evaluation(tmp_path / "nothing", Copier())]
+    )
     rows = {(row.key, row.model): row for row in comparison.rows}
     assert rows["rollout.l1.over_persistence.4", "half"].value == pytest.approx(0.5, rel=1e-4)
     assert ("gain_over_first", "half") not in rows
@@ -103,7 +109,7 @@ def with_runs(
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
     folder = tmp_path_factory.mktemp("two")
-    return compare([written(folder / "half", Halfway()), written(folder / "nothing", Copier())])
+    return compare([write_evaluation(folder / "half", Halfway()), write_evaluation(folder / "nothing", Copier())])
 
 
 @pytest.mark.parametrize(
@@ -167,19 +173,25 @@ def test_comparison_sentence_has_gain_interval_and_reference(two: Comparison, ga
     ],
 )
 def test_comparing_different_clips_raises(tmp_path: Path, changes: dict[str, object], words: str) -> None:
-    run, other_run = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle(), **changes)  # type: ignore[arg-type]
+    run, other_run = (
+        write_evaluation(tmp_path / "one", Oracle()),
+        write_evaluation(tmp_path / "other", Oracle(), **changes),
+    )  # type: ignore[arg-type]
     with pytest.raises(InputError, match=f"measured on different clips.*{words}"):
         compare([run, other_run])
 
 
 def test_different_latents_give_a_note(tmp_path: Path) -> None:
-    run, other_run = written(tmp_path / "one", Halfway()), written(tmp_path / "other", Halfway(), seed=5)
+    run, other_run = (
+        write_evaluation(tmp_path / "one", Halfway()),
+        write_evaluation(tmp_path / "other", Halfway(), seed=5),
+    )
     assert "another encoder or crop" in compare([run, other_run]).notes[0]
 
 
 def test_unevaluated_run_raises_with_the_command_that_evaluates_it(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no metrics\.json.*vjepa2-ac evaluate"):
-        compare([written(tmp_path / "one", Oracle()), tmp_path])
+        compare([write_evaluation(tmp_path / "one", Oracle()), tmp_path])
     with pytest.raises(InputError, match="no such folder"):
         compare([tmp_path / "one", tmp_path / "nowhere"])
     with pytest.raises(InputError, match="two or more"):
@@ -195,7 +207,7 @@ def test_unevaluated_run_raises_with_the_command_that_evaluates_it(tmp_path: Pat
     ],
 )
 def test_damaged_metrics_file_raises_with_its_path(tmp_path: Path, changes: dict[str, object], words: str) -> None:
-    run, other_run = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle())
+    run, other_run = write_evaluation(tmp_path / "one", Oracle()), write_evaluation(tmp_path / "other", Oracle())
     metrics = json.loads((other_run / METRICS_FILE).read_text())
     (other_run / METRICS_FILE).write_text(json.dumps(metrics | changes))
     with pytest.raises(InputError, match=words):
@@ -203,7 +215,9 @@ def test_damaged_metrics_file_raises_with_its_path(tmp_path: Path, changes: dict
 
 
 def test_comparison_table_has_every_row(tmp_path: Path) -> None:
-    comparison = compare([written(tmp_path / "half_1", Halfway()), written(tmp_path / "100%", Copier())])
+    comparison = compare(
+        [write_evaluation(tmp_path / "half_1", Halfway()), write_evaluation(tmp_path / "100%", Copier())]
+    )
     with write_csv(comparison.rows, tmp_path / "comparison.csv").open(newline="") as file:
         rows = [(row["key"], row["model"], float(row["value"])) for row in csv.DictReader(file)]
     assert rows == [(row.key, row.model, pytest.approx(row.value, nan_ok=True)) for row in comparison.rows]

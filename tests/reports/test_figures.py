@@ -29,15 +29,15 @@ NAMES = ("runs/lora", "_hidden", r"$\frac$", *(f"run {number}" for number in ran
 
 
 def test_each_run_has_its_name_and_a_distinct_line_style(tmp_path, monkeypatch) -> None:
-    drawn: list[Figure] = []
+    figures: list[Figure] = []
     save = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), save(self, *a, **k))[1])
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), save(self, *a, **k))[1])
     curves = {name: (Estimate(0.9, 0.8, 1.0), Estimate(0.8, 0.7, 0.9)) for name in NAMES}
     comparison = Comparison("errors", (), np.array([0.5, 1.0]), curves, (), {}, {})
     assert plot_comparison(comparison, tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
-    (legend,) = drawn[0].legends
+    (legend,) = figures[0].legends
     assert [text.get_text() for text in legend.get_texts()] == ["persistence (copy the last frame)", *NAMES]
-    lines = drawn[0].axes[0].get_lines()[1:]
+    lines = figures[0].axes[0].get_lines()[1:]
     assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == len(NAMES)
 
 
@@ -77,8 +77,8 @@ def test_many_goals_and_a_mask_are_shown(tmp_path: Path) -> None:
 def test_decoded_plan_adds_a_row_even_without_a_plan(tmp_path: Path) -> None:
     decoder = load_decoder(write_decoder(tmp_path / "decoder", tiny_model()))
     result, path = make_plan_result(start=100), tmp_path / "imagined.png"
-    with Image.open(plot_plan(result, path, imagine_plan(result, decoder))) as picture:
-        assert picture.height > pixels_of(result, tmp_path).shape[0] + 100
+    with Image.open(plot_plan(result, path, imagine_plan(result, decoder))) as plot:
+        assert plot.height > pixels_of(result, tmp_path).shape[0] + 100
 
 
 def test_images_are_stacked_horizontally_below_their_captions() -> None:

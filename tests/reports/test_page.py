@@ -61,11 +61,11 @@ class Page(HTMLParser):
         self.shown += data
 
 
-Usual = tuple[Evaluation, str, Page]
+FullPage = tuple[Evaluation, str, Page]
 
 
 @pytest.fixture(scope="module")
-def usual(_undrawn: Callable[[pytest.MonkeyPatch], None]) -> Usual:
+def full_page(_undrawn: Callable[[pytest.MonkeyPatch], None]) -> FullPage:
     """Return an evaluation with all measurements, its page with all figures, and the parsed page."""
     result = decoded_strips(evaluation(others=("runs/other",)))
     with pytest.MonkeyPatch.context() as patch:
@@ -91,8 +91,8 @@ def images(html: str) -> list[bytes]:
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_first_screen_shows_the_console_summary_and_further_numbers(usual: Usual) -> None:
-    for result, changes in ((usual[0], {}), (evaluation(episodes=2, clips=8), {"planning": SOLVED})):
+def test_first_screen_shows_the_console_summary_and_further_numbers(full_page: FullPage) -> None:
+    for result, changes in ((full_page[0], {}), (evaluation(episodes=2, clips=8), {"planning": SOLVED})):
         summary = replace(summarize(result, make_rows(result)), **changes)
         first = render_page(result, summary).partition("<details")[0]
         shown = " ".join(Page(re.sub("<[^>]*>", " ", first.partition("</style>")[2])).shown.split())
@@ -166,8 +166,8 @@ def test_hostile_names_change_only_text_of_the_page(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.usefixtures("drawn")
-def test_page_is_self_contained_and_deterministic(usual: Usual) -> None:
-    result, html, page = usual
+def test_page_is_self_contained_and_deterministic(full_page: FullPage) -> None:
+    result, html, page = full_page
     links = [values[key] or "" for _, values in page.elements for key in ("href", "src", "srcset") if key in values]
     assert all(link.startswith("data:image/") for link in links)
     assert not re.search(r"https?:|//\w|@import|url\(|\bon\w+=|javascript:", re.sub(r"base64,[^\"]*", "", html))
@@ -175,8 +175,8 @@ def test_page_is_self_contained_and_deterministic(usual: Usual) -> None:
 
 
 @pytest.mark.usefixtures("drawn")
-def test_page_stays_below_its_size_limit(usual: Usual, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert len(usual[1]) < 2_000_000, "with all figures"
+def test_page_stays_below_its_size_limit(full_page: FullPage, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len(full_page[1]) < 2_000_000, "with all figures"
     monkeypatch.setattr(write, "figure_to_svg", lambda *_: "")
     rng = np.random.default_rng(0)
     result = evaluation(frames=16, size=256)
@@ -212,8 +212,8 @@ def test_single_episode_without_images_has_no_intervals_and_no_nan() -> None:
     assert html.count("data:image/webp") == len(result.examples)
 
 
-def test_images_are_described_tables_have_captions_and_headings_do_not_jump(usual: Usual) -> None:
-    _, html, page = usual
+def test_images_are_described_tables_have_captions_and_headings_do_not_jump(full_page: FullPage) -> None:
+    _, html, page = full_page
     levels = "".join(tag[1] for tag, _ in page.elements if re.fullmatch("h[1-6]", tag))
     assert re.fullmatch("1(2+3*)+", levels)
     assert all(attributes.get("alt") for tag, attributes in page.elements if tag == "img")

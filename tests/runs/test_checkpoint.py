@@ -377,7 +377,7 @@ def test_checkpoints_are_selected_by_newest_best_and_step(run: Path, selection: 
 
 
 @pytest.mark.parametrize(
-    ("written", "reason"),
+    ("old_reason", "reason"),
     [
         ("step-00000010 (as asked for)", "as requested"),
         ("step-00000030 (the newest: none was selected)", "the newest, none was selected by validation"),
@@ -385,8 +385,8 @@ def test_checkpoints_are_selected_by_newest_best_and_step(run: Path, selection: 
         ("", ""),
     ],
 )
-def test_reason_in_an_older_file_equals_the_current_reason(written: str, reason: str) -> None:
-    assert selection_reason(written) == reason
+def test_reason_in_an_older_file_equals_the_current_reason(old_reason: str, reason: str) -> None:
+    assert selection_reason(old_reason) == reason
 
 
 @pytest.mark.parametrize(("selection", "problem"), [("15", "no checkpoint of step 15"), ("bset", "--checkpoint bset")])

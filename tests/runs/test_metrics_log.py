@@ -53,8 +53,10 @@ def test_rows_are_synced_before_the_next_checkpoint(make_config, reporter, monke
     logged_steps = [row["step"] for row in read_metrics_log(folder / "metrics.jsonl")]
     assert logged_steps == [0, 1, 2, 2], "validation, step 1, step 2, validation"
     lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
-    ends = [len("".join(lines[:rows])) for rows in (1, 2, 4)]  # after the base model's validation, and after each step
-    for index, end in zip(states, ends, strict=True):
+    lengths = [
+        len("".join(lines[:rows])) for rows in (1, 2, 4)
+    ]  # after the base model's validation, and after each step
+    for index, end in zip(states, lengths, strict=True):
         assert f"metrics.jsonl {end}" in flushed[:index]
 
 

@@ -184,12 +184,12 @@ def test_checkpoint_of_step_0_is_described_as_untrained(
 
 
 def test_checkpoint_of_step_0_is_evaluated_once_as_base_model(base_run: Path, caplog: pytest.LogCaptureFixture) -> None:
-    written = write_evaluation(evaluate_subject(str(base_run), FEW), base_run)
+    report = write_evaluation(evaluate_subject(str(base_run), FEW), base_run)
     assert caplog.messages == [SELECTED]
-    assert [(model.name, model.role) for model in written.evaluation.models.values()] == [("base", "trained")]
-    assert SELECTED in written.evaluation.notes
-    assert written.summary.subject == f"{base_run}, step 0 (the base model)"
-    assert SELECTED in written.report.read_text()
+    assert [(model.name, model.role) for model in report.evaluation.models.values()] == [("base", "trained")]
+    assert SELECTED in report.evaluation.notes
+    assert report.summary.subject == f"{base_run}, step 0 (the base model)"
+    assert SELECTED in report.report.read_text()
     metrics = read_metrics(base_run)
     assert (metrics.about.is_base, metrics.models, metrics.base) == (True, ("base",), None)
     export_run(base_run, base_run / "hub", "hub")

@@ -25,7 +25,7 @@ TWICE = ["--episodes", "2", "--steps", "2", "--films", "1"]
 
 
 @pytest.fixture(scope="module")
-def of_joints(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+def joint_model(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     """Return a model of seven joint angles and a gripper, and a config that says so."""
     folder = tmp_path_factory.mktemp("joints")
     vector_model(8).save_pretrained(folder / "model")
@@ -36,9 +36,9 @@ def of_joints(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
 
 
 def test_joint_model_acts_in_joint_space(
-    of_joints: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    joint_model: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model, config = of_joints
+    model, config = joint_model
     arguments = ["simulate", model, "--config", str(config), "--domain", "B", *TWICE, "--out", str(tmp_path), *SMALL]
     assert main([*arguments, "planning.limits.axes=[0.2]"]) == 0
     assert metrics(tmp_path)["policies"]["model"]["why_counts"] == {"planned": 4}

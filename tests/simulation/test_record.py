@@ -128,14 +128,14 @@ SPECS = [
 ]
 
 
-def written(folder: Path, spec: RecordingSpec, **changes: Any) -> Path:
+def write_description(folder: Path, spec: RecordingSpec, **changes: Any) -> Path:
     (folder / SIMULATION_FILE).write_text(json.dumps(RecordedSimulation.of(spec, 2).as_dict() | changes))
     return folder
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=["A", "random", "task", "place", "recipe"])
 def test_read_spec_equals_recorded_spec(tmp_path: Path, spec: RecordingSpec) -> None:
-    read = read_simulation(written(tmp_path, spec))
+    read = read_simulation(write_description(tmp_path, spec))
     assert read == RecordedSimulation.of(spec, 2)
     assert (read.worlds, read.episodes) == (spec.worlds, 2)
 
@@ -148,7 +148,7 @@ def test_folder_without_simulation_file_raises(tmp_path: Path) -> None:
 
 
 def test_episode_of_another_recording_raises(tmp_path: Path) -> None:
-    simulation = read_simulation(written(tmp_path, RecordingSpec("A", 5)))
+    simulation = read_simulation(write_description(tmp_path, RecordingSpec("A", 5)))
     name = record_name(RecordingSpec("A", 5), 1)
     assert simulation.number_of(name) == 1
     other_names = [record_name(RecordingSpec("A", 5), 2), record_name(RecordingSpec("A", 5, seed=1), 1)]
@@ -176,4 +176,4 @@ def record_name(spec: RecordingSpec, index: int) -> str:
 )
 def test_damaged_simulation_file_raises(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        read_simulation(written(tmp_path, RecordingSpec(DOMAIN_A, 5), **changes))
+        read_simulation(write_description(tmp_path, RecordingSpec(DOMAIN_A, 5), **changes))

@@ -75,8 +75,8 @@ def test_oracle_solves_tasks_and_zero_and_random_actions_do_not(task: TaskName, 
         if task != "reach":
             assert episode.blocks.shape == (STEPS[task] + 1, 4)
             np.testing.assert_allclose(episode.blocks[0], episode.trial.problem.block_start, atol=1e-9)
-            ends = np.linalg.norm(episode.blocks[-1, :3] - episode.trial.problem.block_goal[:3])
-            assert episode.distances_m[-1] == pytest.approx(ends)
+            distance = np.linalg.norm(episode.blocks[-1, :3] - episode.trial.problem.block_goal[:3])
+            assert episode.distances_m[-1] == pytest.approx(distance)
         if task == "place":
             carried = episode.blocks[:, 2] > 0.05
             assert episode.blocks[:, 2].max() > 0.06 + 0.03, "off the table by half a block"

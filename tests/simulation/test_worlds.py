@@ -204,9 +204,9 @@ def fail(command: str, timeout_s: float | None = None) -> str:
 
 
 @pytest.mark.usefixtures("short_wait")
-@pytest.mark.parametrize("written", ["", "{"])
-def test_environment_timeout_raises_with_last_error_output(program: Program, written: str) -> None:
-    print_both = f"print('waiting for a key', file=sys.stderr, flush=True); print({written!r}, end='', flush=True)"
+@pytest.mark.parametrize("output", ["", "{"])
+def test_environment_timeout_raises_with_last_error_output(program: Program, output: str) -> None:
+    print_both = f"print('waiting for a key', file=sys.stderr, flush=True); print({output!r}, end='', flush=True)"
     message = fail(program(f"{print_both}; time.sleep(1000)"), 0.1)
     assert "no answer within 0.1 s\nwaiting for a key\n" in message
     assert "--world-timeout" in message

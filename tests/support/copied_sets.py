@@ -54,7 +54,7 @@ def write_raw(folder: Path, recordings: Sequence[int]) -> Path:
     for index, number in enumerate(recordings):
         states = synthetic_states(STEPS, seed=number)
         frames = {"1234": [draw_frame(state, size=SIZE) for state in states]}
-        write_raw_droid(folder / f"LAB/success/2023-07-{index + 1:02d}/{index:04d}", states, pictures=frames)
+        write_raw_droid(folder / f"LAB/success/2023-07-{index + 1:02d}/{index:04d}", states, frames_by_serial=frames)
     return folder
 
 

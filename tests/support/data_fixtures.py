@@ -23,11 +23,11 @@ def droid(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def spoiled(droid: Path, tmp_path: Path) -> Callable[[Callable[[Features], None]], Path]:
+def write_with_changed_record(droid: Path, tmp_path: Path) -> Callable[[Callable[[Features], None]], Path]:
     """Copy the data set, and change the features of the first record by a function; the CRC is correct."""
 
-    def spoil(change: Callable[[Features], None]) -> Path:
-        folder = tmp_path / "spoiled"
+    def write_changed(change: Callable[[Features], None]) -> Path:
+        folder = tmp_path / "changed"
         shutil.copytree(droid, folder)
         shard = sorted(folder.glob("*.tfrecord-*"))[0]
         records = [read_record(span) for span in index_records(shard)]
@@ -38,4 +38,4 @@ def spoiled(droid: Path, tmp_path: Path) -> Callable[[Callable[[Features], None]
                 write_record(file, record)
         return folder
 
-    return spoil
+    return write_changed

@@ -59,9 +59,9 @@ def errors(rng: np.random.Generator, level: float, horizon: int, episode_of: np.
 def _predicted(
     rng: np.random.Generator, actions: ActionMode, level: float, horizon: int, episode_of: np.ndarray
 ) -> dict[tuple[ActionMode, Mode, str], np.ndarray]:
-    by_mode = {mode: errors(rng, level, horizon, episode_of) for mode in MODES}
-    of_l2 = {(actions, mode, L2.name): values**2 * 1.6 for mode, values in by_mode.items()}
-    return {(actions, mode, L1.name): values for mode, values in by_mode.items()} | of_l2
+    errors_by_mode = {mode: errors(rng, level, horizon, episode_of) for mode in MODES}
+    l2_errors = {(actions, mode, L2.name): values**2 * 1.6 for mode, values in errors_by_mode.items()}
+    return {(actions, mode, L1.name): values for mode, values in errors_by_mode.items()} | l2_errors
 
 
 def ranking_of(ranks: np.ndarray, ids: tuple[str, ...]) -> ActionRanking:

@@ -82,17 +82,17 @@ def write_v30(
     *,
     episodes_per_video: int = 3,
     gop: int = 2,
-    pictures: str = "video",
+    image_format: str = "video",
 ) -> Path:
     """Write a v3.0 data set: several episodes in each Parquet file and in each video. Returns the folder."""
     root = Path(folder)
     rows: list[dict[str, Any]] = []
     for file, first in enumerate(range(0, len(episodes), 2)):
         numbers = range(first, min(first + 2, len(episodes)))
-        table = pa.concat_tables([_rows(episodes, number, pictures) for number in numbers])
+        table = pa.concat_tables([_rows(episodes, number, image_format) for number in numbers])
         _write_table(root / _DATA_V30.format(chunk_index=0, file_index=file), table)
         rows += [{"data/chunk_index": 0, "data/file_index": file} for _ in numbers]
-    if pictures == "video":
+    if image_format == "video":
         for key in episodes[0].frames:
             _write_shared_videos(root, key, episodes, rows, episodes_per_video, gop)
     for number, (row, episode) in enumerate(zip(rows, episodes, strict=True)):
@@ -105,18 +105,18 @@ def write_v30(
     tasks = sorted({episode.task for episode in episodes})
     table = pa.table({"task_index": range(len(tasks)), "__index_level_0__": tasks})
     _write_table(root / "meta/tasks.parquet", table)
-    video = _VIDEO_V30 if pictures == "video" else None
-    _write_info(root, episodes, "v3.0", {"data_path": _DATA_V30, "video_path": video}, pictures)
+    video = _VIDEO_V30 if image_format == "video" else None
+    _write_info(root, episodes, "v3.0", {"data_path": _DATA_V30, "video_path": video}, image_format)
     return root
 
 
-def write_v21(folder: str | Path, episodes: Sequence[Recorded], *, gop: int = 2, pictures: str = "video") -> Path:
+def write_v21(folder: str | Path, episodes: Sequence[Recorded], *, gop: int = 2, image_format: str = "video") -> Path:
     """Write a v2.1 data set: a Parquet file and a video for each episode. Returns the folder."""
     root = Path(folder)
     for number, episode in enumerate(episodes):
         at = {"episode_chunk": number // 3, "episode_index": number}
-        _write_table(root / _DATA_V21.format(**at), _rows(episodes, number, pictures))
-        if pictures == "video":
+        _write_table(root / _DATA_V21.format(**at), _rows(episodes, number, image_format))
+        if image_format == "video":
             for key, frames in episode.frames.items():
                 write_mp4(root / _VIDEO_V21.format(**at, video_key=key), frames, rate=FPS, gop=gop)
     lines = [
@@ -125,8 +125,8 @@ def write_v21(folder: str | Path, episodes: Sequence[Recorded], *, gop: int = 2,
     ]
     (root / "meta").mkdir(parents=True, exist_ok=True)
     (root / "meta/episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    paths = {"data_path": _DATA_V21, "video_path": _VIDEO_V21 if pictures == "video" else None}
-    _write_info(root, episodes, "v2.1", paths | {"chunks_size": 3}, pictures)
+    paths = {"data_path": _DATA_V21, "video_path": _VIDEO_V21 if image_format == "video" else None}
+    _write_info(root, episodes, "v2.1", paths | {"chunks_size": 3}, image_format)
     return root
 
 
@@ -155,14 +155,14 @@ def column_of(values: np.ndarray, *, fixed: bool = False) -> pa.Array:
     return pa.array(values.tolist(), type=pa.list_(kind, values.shape[1]) if fixed else pa.list_(kind))
 
 
-def _rows(episodes: Sequence[Recorded], number: int, pictures: str) -> pa.Table:
+def _rows(episodes: Sequence[Recorded], number: int, image_format: str) -> pa.Table:
     episode, length = episodes[number], _length(episodes[number])
     start = sum(_length(earlier) for earlier in episodes[:number])
     columns = {name: column_of(values, fixed=values.shape[1] == 6) for name, values in episode.columns.items()}
-    if pictures != "video":
+    if image_format != "video":
         kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
         for key, frames in episode.frames.items():
-            stored = [{"bytes": _encoded(frame, pictures), "path": f"{step}"} for step, frame in enumerate(frames)]
+            stored = [{"bytes": _encoded(frame, image_format), "path": f"{step}"} for step, frame in enumerate(frames)]
             columns[key] = pa.array(stored, type=kind)
     return pa.table(
         columns
@@ -197,7 +197,7 @@ def _write_table(path: Path, table: pa.Table) -> None:
 
 
 def _write_info(
-    root: Path, episodes: Sequence[Recorded], version: str, paths: Mapping[str, object], pictures: str
+    root: Path, episodes: Sequence[Recorded], version: str, paths: Mapping[str, object], image_format: str
 ) -> None:
     first = episodes[0]
     features: dict[str, Any] = {
@@ -205,7 +205,7 @@ def _write_info(
         for name, values in first.columns.items()
     }
     for key, frames in first.frames.items():
-        dtype = "video" if pictures == "video" else "image"
+        dtype = "video" if image_format == "video" else "image"
         features[key] = {"dtype": dtype, "shape": list(frames[0].shape), "names": ["height", "width", "channels"]}
     for name, dtype in (("timestamp", "float32"), *((n, "int64") for n in ("frame_index", "episode_index", "index"))):
         features[name] = {"dtype": dtype, "shape": [1], "names": None}

@@ -14,7 +14,7 @@ ROWS, COLUMNS = 24, 32
 
 
 def spot_states(number: int, steps: int = STEPS) -> Float[np.ndarray, "steps 7"]:
-    """Return poses on a way over the table, at a speed that changes all the time."""
+    """Return poses on a path over the table, with a speed that changes continuously."""
     generator = np.random.default_rng(number)
     knots = np.arange(0, steps + 8, 4)
     speed = generator.uniform(0.0, 0.03, steps)  # metres a step
@@ -29,7 +29,7 @@ def spot_states(number: int, steps: int = STEPS) -> Float[np.ndarray, "steps 7"]
 
 
 def spot_frames(states: Float[np.ndarray, "steps 7"]) -> UInt8[np.ndarray, "steps rows columns 3"]:
-    """Return pictures of a bright spot where the pose is, before a table that is more red than blue."""
+    """Return images of a bright spot at the pose, in front of a table that is more red than blue."""
     rows, columns = np.mgrid[0:ROWS, 0:COLUMNS]
     down, right = 12 - 12 * (states[:, 0] - 0.5), 16 + 12 * states[:, 1]
     distance = (rows - down[:, None, None]) ** 2 + (columns - right[:, None, None]) ** 2
@@ -40,12 +40,12 @@ def spot_frames(states: Float[np.ndarray, "steps 7"]) -> UInt8[np.ndarray, "step
 def spot_excerpt(
     name: int | str, states: Float[np.ndarray, "steps 7"], frames: UInt8[np.ndarray, "steps rows columns 3"]
 ) -> Excerpt:
-    """Return these as the check looks at them."""
+    """Return the excerpt of an episode with these states and images."""
     return Excerpt(str(name), states, convert_to_small_grey(frames))
 
 
 def write_spots(folder: Path, episodes: list[tuple[np.ndarray, np.ndarray]]) -> Path:
-    """Write states and pictures as .npz episodes."""
+    """Write states and images as .npz episodes."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, (states, frames) in enumerate(episodes):
         np.savez(folder / f"{number:03d}.npz", states=states, frames=frames, fps_hz=RATE_HZ)

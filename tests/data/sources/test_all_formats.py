@@ -61,7 +61,7 @@ def data_sets(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         write_raw_droid(
             root / f"droid_raw/LAB/success/2023-07-07/Fri_Jul__7_09:4{number}:00_2023",
-            states.astype(np.float64), pictures={"23404442": frames}, joint_velocities=velocities, gop=4,
+            states.astype(np.float64), frames_by_serial={"23404442": frames}, joint_velocities=velocities, gop=4,
         )  # fmt: skip
         (root / "npz").mkdir(exist_ok=True)
         np.savez(root / f"npz/{number}.npz", states=states, frames=np.stack(frames), fps_hz=15.0)

@@ -30,7 +30,7 @@ FRAMES = {
 
 
 def write(root: Path, folder: str = IDENTITY, **changes: Any) -> Path:
-    return write_raw_droid(root / folder, STATES, **{"pictures": FRAMES, "gop": 8, **changes})
+    return write_raw_droid(root / folder, STATES, **{"frames_by_serial": FRAMES, "gop": 8, **changes})
 
 
 def source(path: Path, **values: Any) -> RawDroidSource:
@@ -45,8 +45,8 @@ def psnr(first: np.ndarray, second: np.ndarray) -> float:
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two episodes, one a failure; changed by no test."""
     root = tmp_path_factory.mktemp("raw")
-    write(root, pictures={LEFT: FRAMES[LEFT]})
-    write(root, "LAB/failure/2023-07-07/Fri_Jul__7_09:50:00_2023", pictures={LEFT: FRAMES[LEFT]}, success=False)
+    write(root, frames_by_serial={LEFT: FRAMES[LEFT]})
+    write(root, "LAB/failure/2023-07-07/Fri_Jul__7_09:50:00_2023", frames_by_serial={LEFT: FRAMES[LEFT]}, success=False)
     return root
 
 
@@ -80,7 +80,7 @@ def test_identity_is_independent_of_the_configured_subfolder(tree: Path, part: s
 
 @pytest.mark.parametrize("frames", [STEPS - 1, STEPS, STEPS + 1])
 def test_episode_length_is_limited_by_states_and_frames(tmp_path: Path, frames: int) -> None:
-    write(tmp_path, pictures={LEFT: (FRAMES[LEFT] * 2)[:frames]})
+    write(tmp_path, frames_by_serial={LEFT: (FRAMES[LEFT] * 2)[:frames]})
     raw = source(tmp_path)
     steps = min(frames, STEPS)
     assert [info.num_steps for info in raw.infos()] == [steps]
@@ -115,7 +115,7 @@ def test_extrinsics_belong_to_the_selected_camera(tmp_path: Path) -> None:
 def test_trajectory_and_video_are_parsed_once_per_machine(
     tmp_path: Path, b_frames: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write(tmp_path / "raw", pictures={LEFT: FRAMES[LEFT]}, b_frames=b_frames)
+    write(tmp_path / "raw", frames_by_serial={LEFT: FRAMES[LEFT]}, b_frames=b_frames)
     cache = {"dir": str(tmp_path / "cache")}
     first = source(tmp_path / "raw", disk_cache=cache).read(0)
     frames = first.read_frames([3, 17])

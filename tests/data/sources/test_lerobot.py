@@ -128,8 +128,8 @@ def test_reads_are_independent_of_order_threads_and_process(data_set: Path) -> N
             read: list[Episode] = list(pool.map(source.read, order))
             frames = list(pool.map(lambda episode: episode.read_frames([3, 8]), read))
         return {
-            number: (episode.states.tobytes(), pictures.tobytes())
-            for number, episode, pictures in zip(order, read, frames, strict=True)
+            number: (episode.states.tobytes(), images.tobytes())
+            for number, episode, images in zip(order, read, frames, strict=True)
         }
 
     source = source_of(data_set)
@@ -138,15 +138,15 @@ def test_reads_are_independent_of_order_threads_and_process(data_set: Path) -> N
     assert read_all(pickle.loads(pickle.dumps(source)), [4, 2, 0, 3, 1]) == forward  # noqa: S301 - our own bytes
 
 
-@pytest.mark.parametrize("pictures", ["png", "jpeg"])
+@pytest.mark.parametrize("image_format", ["png", "jpeg"])
 @pytest.mark.parametrize("write", [write_v30, write_v21])
 def test_frames_are_read_from_image_columns(
-    write: Callable[..., Path], pictures: str, episodes: list[Recorded], tmp_path: Path
+    write: Callable[..., Path], image_format: str, episodes: list[Recorded], tmp_path: Path
 ) -> None:
-    source = source_of(write(tmp_path / "set", episodes[:3], pictures=pictures))
+    source = source_of(write(tmp_path / "set", episodes[:3], image_format=image_format))
     frames = source.read(1).read_frames([7, 2])
     assert [numbers_of(frame) for frame in frames] == [(1, 7, 0), (1, 2, 0)]
-    if pictures == "png":
+    if image_format == "png":
         np.testing.assert_array_equal(frames[0], episodes[1].frames[KEY][7])
 
 
@@ -166,7 +166,7 @@ def count_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_later_clip_reads_images_from_the_cache(
     write: Callable[..., Path], episodes: list[Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root, cache = write(tmp_path / "set", episodes[:3], pictures="png"), {"dir": str(tmp_path / "cache")}
+    root, cache = write(tmp_path / "set", episodes[:3], image_format="png"), {"dir": str(tmp_path / "cache")}
     from_tables = count_images(monkeypatch)
     source = source_of(root, disk_cache=cache)
     expected = source.read(1).read_frames([3, 7, 11])
@@ -293,7 +293,7 @@ def test_depth_map_is_not_a_camera(flag: dict[str, object], copy: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "spoil",
+    "damage_file",
     [
         lambda info: info.write_text("[1, 2]"),
         lambda info: change_info(info.parent.parent, total_episodes=6),
@@ -302,8 +302,8 @@ def test_depth_map_is_not_a_camera(flag: dict[str, object], copy: Path) -> None:
         lambda info: change_info(info.parent.parent, video_path=None),
     ],
 )
-def test_damaged_meta_files_raise_with_path(spoil: Callable[[Path], None], copy: Path) -> None:
-    spoil(copy / "meta/info.json")
+def test_damaged_meta_files_raise_with_path(damage_file: Callable[[Path], None], copy: Path) -> None:
+    damage_file(copy / "meta/info.json")
     with pytest.raises(InputError, match=r"meta/(info\.json|episodes)"):
         source_of(copy).infos()
 
@@ -316,15 +316,15 @@ def test_missing_data_set_raises_with_expected_layout(tmp_path: Path) -> None:
 # --- unusable episodes ------------------------------------------------------------------------------------------
 
 
-def spoiled(change: Callable[[list[list[float]]], Any]) -> Callable[[Path], None]:
+def edit_states(change: Callable[[list[list[float]]], Any]) -> Callable[[Path], None]:
     """Return a function that replaces the states in the first file of a data set by `change(states)`."""
 
-    def spoil(root: Path) -> None:
+    def damage_file(root: Path) -> None:
         rows = pq.read_table(first_rows(root)).column(STATE[0]).to_pylist()
         states = change(rows)
         change_table(first_rows(root), **{STATE[0]: column_of(states) if isinstance(states, np.ndarray) else states})
 
-    return spoil
+    return damage_file
 
 
 def with_value(step: int, value: float) -> Callable[[list[list[float]]], np.ndarray]:
@@ -332,11 +332,11 @@ def with_value(step: int, value: float) -> Callable[[list[list[float]]], np.ndar
 
 
 def select_rows(*indices: int) -> Callable[[Path], None]:
-    def spoil(root: Path) -> None:
+    def damage_file(root: Path) -> None:
         table = pq.read_table(first_rows(root))
         pq.write_table(table.take([*indices, *range(12, len(table))]), first_rows(root))
 
-    return spoil
+    return damage_file
 
 
 LIST = pa.list_(pa.float32())
@@ -344,14 +344,14 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "no video": (lambda root: first_video(root).unlink(), f"{KEY}.*no such video.*for 12 rows in data/chunk-000/"),
     "no rows": (lambda root: first_rows(root).unlink(), "no such file"),
     "cut": (lambda root: first_rows(root).write_bytes(first_rows(root).read_bytes()[:-200]), r"\.parquet.*damaged"),
-    "no column": (spoiled(lambda _: None), f"no column {STATE[0]}.*one of episode_index, frame_index, timestamp"),
+    "no column": (edit_states(lambda _: None), f"no column {STATE[0]}.*one of episode_index, frame_index, timestamp"),
     "no commands": (lambda root: change_table(first_rows(root), **{"action.joint_velocity": None}), "no column action"),
-    "not a number": (spoiled(with_value(3, np.nan)), "episode_000000: step 3: the numbers"),
-    "out of reach": (spoiled(with_value(5, 50.0)), "Expected a position within 5 m"),
-    "five numbers": (spoiled(lambda rows: np.float32(rows)[:, :5]), r"5 numbers per row\. Expected 6, according to"),
-    "uneven": (spoiled(lambda rows: pa.array([rows[0][:5], *rows[1:]], LIST)), "5 numbers in one row and 6 in another"),
-    "missing state": (spoiled(lambda rows: pa.array([None, *rows[1:]], LIST)), "1 row without a value"),
-    "text for numbers": (spoiled(lambda rows: pa.array(["a"] * len(rows))), "values of type string"),
+    "not a number": (edit_states(with_value(3, np.nan)), "episode_000000: step 3: the numbers"),
+    "out of reach": (edit_states(with_value(5, 50.0)), "Expected a position within 5 m"),
+    "five numbers": (edit_states(lambda rows: np.float32(rows)[:, :5]), r"5 numbers per row\. Expected 6, according to"),
+    "uneven": (edit_states(lambda rows: pa.array([rows[0][:5], *rows[1:]], LIST)), "5 numbers in one row and 6 in another"),
+    "missing state": (edit_states(lambda rows: pa.array([None, *rows[1:]], LIST)), "1 row without a value"),
+    "text for numbers": (edit_states(lambda rows: pa.array(["a"] * len(rows))), "values of type string"),
     "lost rows": (select_rows(*range(10)), r"10 rows\. Expected 12"),
     "mixed rows": (select_rows(1, 0, *range(2, 12)), "frame_index does not count from 0 to 11"),
 }  # fmt: skip
@@ -367,8 +367,8 @@ def only_problem(root: Path) -> str:
 
 @pytest.mark.parametrize("damage", BROKEN)
 def test_unusable_episode_is_a_problem_with_its_name_and_reason(damage: str, copy: Path) -> None:
-    spoil, message = BROKEN[damage]
-    spoil(copy)
+    damage_file, message = BROKEN[damage]
+    damage_file(copy)
     assert re.search(message, only_problem(copy))
 
 

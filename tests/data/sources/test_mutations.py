@@ -32,7 +32,9 @@ def write(data_format: str, root: Path) -> DataConfig:
         write_synthetic_droid(root, steps=[2, 3, 2], size=(16, 32), shards=2)
     elif data_format == "raw":
         folder = root / "LAB/success/2023-07-07/one"
-        write_raw_droid(folder, STATES, pictures={"1": FRAMES}, extrinsics={"1": STATES[:, :6]}, gop=3, b_frames=1)
+        write_raw_droid(
+            folder, STATES, frames_by_serial={"1": FRAMES}, extrinsics={"1": STATES[:, :6]}, gop=3, b_frames=1
+        )
     else:
         root.mkdir()
         save = np.savez if data_format == "npz" else np.savez_compressed

@@ -74,10 +74,10 @@ def test_oversized_lists_are_rejected_from_the_footer(tmp_path: Path, monkeypatc
 
 
 def test_repeated_images_above_the_size_limit_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, picture = tmp_path / "rows.parquet", b"\xff\xd8" + bytes(99_998)
-    table = pa.table({"episode_index": np.repeat([0, 1], 50), "image": repeated(picture, 100)})
+    path, image_bytes = tmp_path / "rows.parquet", b"\xff\xd8" + bytes(99_998)
+    table = pa.table({"episode_index": np.repeat([0, 1], 50), "image": repeated(image_bytes, 100)})
     pq.write_table(table, path, compression="zstd")
-    assert rows_of(path).read_images(str(path), "image", 1) == [picture] * 50
+    assert rows_of(path).read_images(str(path), "image", 1) == [image_bytes] * 50
     monkeypatch.setattr(parquet, "MAX_IMAGE_BYTES", 5 * _MB)
     with pytest.raises(InputError, match="more than 5,242,880 bytes of episode_index, image"):
         rows_of(path).read_images(str(path), "image", 1)

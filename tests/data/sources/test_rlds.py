@@ -22,7 +22,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.simulation.droid_writer import CAMERAS, write_droid_rlds
 
 Features = dict[str, tuple[Any, Any]]
-Spoil = Callable[[Callable[[Features], None]], Path]
+WriteChanged = Callable[[Callable[[Features], None]], Path]
 BRIDGE = RldsFields(
     state=("steps/observation/state",),
     gripper_open=1.0,
@@ -68,12 +68,12 @@ def test_episodes_equal_the_written_episodes(droid: Path) -> None:
         assert episode.control_rate_hz == 15.0
 
 
-def test_only_requested_frames_are_decoded(spoiled: Spoil) -> None:
-    def spoil(features: Features) -> None:
+def test_only_requested_frames_are_decoded(write_with_changed_record: WriteChanged) -> None:
+    def change_features(features: Features) -> None:
         features["steps/observation/exterior_image_1_left"][1][5] = b"\xff\xd8 no JPEG"
         features["steps/observation/wrist_image_left"][1][:] = [b""] * 12
 
-    episode = open_droid(spoiled(spoil)).read(0)
+    episode = open_droid(write_with_changed_record(change_features)).read(0)
     assert episode.read_frames([0, 4, 6]).shape == (3, 48, 96, 3)
     with pytest.raises(InputError, match=r"exterior_image_1_left: step 5: .*not a JPEG"):
         episode.read_frames([4, 5])
@@ -138,11 +138,13 @@ def test_real_robot_episodes_are_read_with_configured_feature_names(shared: Path
         ),
     ],
 )
-def test_unusable_episode_is_a_problem_and_not_in_the_table(spoiled: Spoil, change: Any, message: str) -> None:
-    def spoil(features: Features) -> None:
+def test_unusable_episode_is_a_problem_and_not_in_the_table(
+    write_with_changed_record: WriteChanged, change: Any, message: str
+) -> None:
+    def change_features(features: Features) -> None:
         change(features)
 
-    table = open_droid(spoiled(spoil)).infos()
+    table = open_droid(write_with_changed_record(change_features)).infos()
     assert len(table) == 5
     [problem] = table.problems
     assert "tfrecord-00000-of-00002: record 0 at byte 0" in problem.where
@@ -201,11 +203,11 @@ def test_truncated_shard_loses_only_records_after_the_cut(droid: Path, tmp_path:
     folder = shutil.copytree(droid, tmp_path / "set")
     shard = sorted(folder.glob("*.tfrecord-*"))[0]
     content = shard.read_bytes()
-    ends = [span.end for span in index_records(shard)]
-    for size in (0, 1, 12, 1000, len(content) // 2, len(content) - 1, *ends[:-1]):
+    offsets = [span.end for span in index_records(shard)]
+    for size in (0, 1, 12, 1000, len(content) // 2, len(content) - 1, *offsets[:-1]):
         shard.write_bytes(content[:size])
         table = open_droid(folder).infos()
-        num_complete = sum(end <= size for end in ends)
+        num_complete = sum(end <= size for end in offsets)
         assert (len(table), len(table.problems)) == (3 + num_complete, 3 - num_complete)
         assert all(shard.name in problem.where for problem in table.problems)
         assert [problem.name for problem in table.problems] == [

@@ -14,7 +14,7 @@ HERE = Path(__file__).parent
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 
 
-def picture(number: int) -> np.ndarray:
+def draw_image(number: int) -> np.ndarray:
     """Return a picture that needs no file: 48 x 60 pixels."""
     y, x, c = np.mgrid[:48, :60, :3]
     return ((x * (number + 3) + y * (2 * number + 5) + 40 * c) % 256).astype(np.uint8)
@@ -22,15 +22,15 @@ def picture(number: int) -> np.ndarray:
 
 DROID = {"observation/cartesian_position": STATE[:6], "observation/gripper_position": STATE[6:]}
 DIALOGUE = {
-    "1_goal_and_picture": {"observation/image": picture(0), "observation/state": STATE, "goal/image": picture(9)},
+    "1_goal_and_picture": {"observation/image": draw_image(0), "observation/state": STATE, "goal/image": draw_image(9)},
     "2_same_goal_next_picture": {
-        "observation/image": picture(1),
+        "observation/image": draw_image(1),
         "observation/state": STATE.astype(np.float32),
-        "goal/image": picture(9),
+        "goal/image": draw_image(9),
     },
-    "3_a_state_in_degrees": {"observation/image": picture(1), "observation/state": STATE * [1, 1, 1, 60, 1, 1, 1]},
+    "3_a_state_in_degrees": {"observation/image": draw_image(1), "observation/state": STATE * [1, 1, 1, 60, 1, 1, 1]},
     "4_new_episode_by_prompt": {
-        "observation/exterior_image_1_left": picture(2),
+        "observation/exterior_image_1_left": draw_image(2),
         **DROID,
         "prompt": "cup",
         "reset": True,
@@ -39,9 +39,9 @@ DIALOGUE = {
         "endpoint": "infer",
         "session_id": "7d7c6c0e",
         "prompt": "cup",
-        "observation/exterior_image_0_left": picture(3),
+        "observation/exterior_image_0_left": draw_image(3),
         "observation/joint_position": np.zeros(7),
-        "observation/wrist_image_left": picture(4),
+        "observation/wrist_image_left": draw_image(4),
         **DROID,
         "observation/gripper_position": np.float64(0.2),
     },
