@@ -124,7 +124,7 @@ def test_messages_docstrings_and_comments_use_standard_terms() -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_names_say_what_they_hold() -> None:
+def test_names_contain_no_private_words() -> None:
     package = ROOT / "src/vjepa2_ac"
     wrong = {
         f"{path.relative_to(package)}: {name}"
@@ -150,5 +150,5 @@ def test_sentences_of_pages_are_short() -> None:
 @pytest.mark.parametrize(
     ("text", "words"), [("Each knob has a default.", "knob"), ("It is told\nto the robot.", "told")]
 )
-def test_a_private_word_is_found(text: str, words: str) -> None:
+def test_private_word_is_reported(text: str, words: str) -> None:
     assert words in private_words(ROOT / "README.md", iter([text]))[0]

@@ -98,6 +98,6 @@ def test_long_plan_shows_eight_steps_including_the_last(decoder: TrainedDecoder)
 
 
 @pytest.mark.parametrize("options", [{"start": 100}, {"broken": True}])
-def test_no_images_without_a_plan_or_finite_predictions(decoder: TrainedDecoder, options: dict) -> None:
+def test_missing_plan_or_non_finite_predictions_give_no_images(decoder: TrainedDecoder, options: dict) -> None:
     result = make_plan_result(nodes=0, **options)
     assert imagine_plan(result, decoder).steps == {}

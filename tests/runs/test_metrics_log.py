@@ -139,7 +139,7 @@ def test_non_finite_values_become_null(tmp_path: Path) -> None:
     assert next(read_metrics_log(tmp_path / "metrics.jsonl"))["loss"] is None
 
 
-def test_a_disk_that_stalls_causes_a_warning(
+def test_stalled_disk_causes_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(metrics_log, "STALLED_S", 0.01)

@@ -316,7 +316,7 @@ def test_missing_data_set_raises_with_expected_layout(tmp_path: Path) -> None:
 # --- unusable episodes ------------------------------------------------------------------------------------------
 
 
-def edit_states(change: Callable[[list[list[float]]], Any]) -> Callable[[Path], None]:
+def changed(change: Callable[[list[list[float]]], Any]) -> Callable[[Path], None]:
     """Return a function that replaces the states in the first file of a data set by `change(states)`."""
 
     def damage_file(root: Path) -> None:
@@ -344,14 +344,14 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "no video": (lambda root: first_video(root).unlink(), f"{KEY}.*no such video.*for 12 rows in data/chunk-000/"),
     "no rows": (lambda root: first_rows(root).unlink(), "no such file"),
     "cut": (lambda root: first_rows(root).write_bytes(first_rows(root).read_bytes()[:-200]), r"\.parquet.*damaged"),
-    "no column": (edit_states(lambda _: None), f"no column {STATE[0]}.*one of episode_index, frame_index, timestamp"),
+    "no column": (changed(lambda _: None), f"no column {STATE[0]}.*one of episode_index, frame_index, timestamp"),
     "no commands": (lambda root: change_table(first_rows(root), **{"action.joint_velocity": None}), "no column action"),
-    "not a number": (edit_states(with_value(3, np.nan)), "episode_000000: step 3: the numbers"),
-    "out of reach": (edit_states(with_value(5, 50.0)), "Expected a position within 5 m"),
-    "five numbers": (edit_states(lambda rows: np.float32(rows)[:, :5]), r"5 numbers per row\. Expected 6, according to"),
-    "uneven": (edit_states(lambda rows: pa.array([rows[0][:5], *rows[1:]], LIST)), "5 numbers in one row and 6 in another"),
-    "missing state": (edit_states(lambda rows: pa.array([None, *rows[1:]], LIST)), "1 row without a value"),
-    "text for numbers": (edit_states(lambda rows: pa.array(["a"] * len(rows))), "values of type string"),
+    "not a number": (changed(with_value(3, np.nan)), "episode_000000: step 3: the numbers"),
+    "out of reach": (changed(with_value(5, 50.0)), "Expected a position within 5 m"),
+    "five numbers": (changed(lambda rows: np.float32(rows)[:, :5]), r"5 numbers per row\. Expected 6, according to"),
+    "uneven": (changed(lambda rows: pa.array([rows[0][:5], *rows[1:]], LIST)), "5 numbers in one row and 6 in another"),
+    "missing state": (changed(lambda rows: pa.array([None, *rows[1:]], LIST)), "1 row without a value"),
+    "text for numbers": (changed(lambda rows: pa.array(["a"] * len(rows))), "values of type string"),
     "lost rows": (select_rows(*range(10)), r"10 rows\. Expected 12"),
     "mixed rows": (select_rows(1, 0, *range(2, 12)), "frame_index does not count from 0 to 11"),
 }  # fmt: skip
