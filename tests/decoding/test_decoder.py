@@ -80,16 +80,16 @@ def test_folder_without_a_decoder_raises_with_the_command(tmp_path: Path, name: 
 def test_model_with_another_encoder_crop_or_size_raises(whole_decoder: Path, base_folder: Path) -> None:
     decoder, model = load_decoder(whole_decoder), WorldModel.from_pretrained(base_folder)
     data, square = DataConfig(path=decoder.card.data), DataConfig(path=decoder.card.data, crop="square")
-    assert decoder.require_fit(model, data, subject="run") == ()
+    assert decoder.require_compatible(model, data, subject="run") == ()
     other_encoder = WorldModel.random(ModelSizes.model_validate(TINY), seed=4)
     with pytest.raises(InputError, match=r"does not fit the encoder and crop of run.*vjepa2-ac decoder CONFIG"):
-        decoder.require_fit(other_encoder, data, subject="run")
+        decoder.require_compatible(other_encoder, data, subject="run")
     with pytest.raises(InputError, match=r"data\.crop released, the model's is square"):
-        decoder.require_fit(model, square, subject="run")
+        decoder.require_compatible(model, square, subject="run")
     larger = WorldModel.random(ModelSizes.model_validate(TINY | {"image_size": 64}), seed=3)
     same_encoder = replace(decoder, card=replace(decoder.card, encoder=larger.encoder_fingerprint()))
     with pytest.raises(InputError, match="image size 32, the model's is 64"):
-        same_encoder.require_fit(larger, data, subject="run")
+        same_encoder.require_compatible(larger, data, subject="run")
 
 
 def test_decoder_trained_on_other_data_warns_with_both_data_sets(
@@ -102,14 +102,16 @@ def test_decoder_trained_on_other_data_warns_with_both_data_sets(
     builtin = replace(decoder, name="builtin:sim-tiny")
     cases = {(decoder, training_data): True, (decoder, real): False, (builtin, real): False, (builtin, simulated): True}
     for (trained, data), is_same_data in cases.items():
-        warnings = trained.require_fit(model, DataConfig(path=str(data)), subject="run")
+        warnings = trained.require_compatible(model, DataConfig(path=str(data)), subject="run")
         trained_on = SIMULATED if trained is builtin else str(training_data)
         warning = (
             f"The decoder {trained.name} was trained on {trained_on}, not on {data}: its images may be inaccurate."
         )
         assert warnings == (() if is_same_data else (warning,))
     monkeypatch.chdir(training_data.parent)
-    assert decoder.require_fit(model, DataConfig(path=training_data.name), subject="run") == (), "the same folder"
+    assert decoder.require_compatible(model, DataConfig(path=training_data.name), subject="run") == (), (
+        "the same folder"
+    )
 
 
 # ---- the network ----

@@ -68,7 +68,7 @@ def test_oracle_solves_tasks_and_zero_and_random_actions_do_not(task: TaskName, 
     oracle = run_task(BenchmarkOptions(task, domain, 3, seed=11), Oracle(LIMITS), arm)
     assert oracle.success_rate.value == 1.0
     assert oracle.estimates["final_distance_cm"].value < 3.0
-    assert oracle.why_counts == {"scripted": 3 * STEPS[task]}
+    assert oracle.reason_counts == {"scripted": 3 * STEPS[task]}
     assert not oracle.unreachable.any()
     for episode in oracle.episodes:
         assert (np.abs(episode.actions) <= largest_action(LIMITS)).all()
@@ -148,7 +148,7 @@ def test_planner_acts_within_limits_and_stores_frames_of_some_episodes(arm: Simu
     policy, reported = Planning(make_controller(horizon=1, limits=SMALL), name="tiny"), []
     options = BenchmarkOptions("reach", DOMAIN_B, episodes=2, steps=2, films=1)
     result = run_task(options, policy, arm, lambda *numbers: reported.append(numbers))
-    assert (result.policy, result.why_counts) == ("tiny", {"planned": 4})
+    assert (result.policy, result.reason_counts) == ("tiny", {"planned": 4})
     assert reported == [(decisions, 4) for decisions in range(5)]
     assert all((np.abs(episode.actions[:, :3]) <= 0.03).all() for episode in result.episodes)
     assert np.abs(result.episodes[0].actions[:, :3]).max() > 0
@@ -167,7 +167,7 @@ def fake(*distances_m: float, unreachable: int = 0) -> EpisodeResult:
         distances_m=np.array(distances_m),
         reached=np.array(distances_m) < 0.05,
         seconds=np.arange(1.0, count),
-        whys=("planned",) * (count - 2) + ("out of time",),
+        reasons=("planned",) * (count - 2) + ("out of time",),
         unreachable=unreachable,
         goal_image=UNSEEN,
         frames=None,
@@ -184,7 +184,7 @@ def test_success_is_measured_at_the_end_and_success_ever_separately() -> None:
     assert {name: metrics[name].value for name in expected} == pytest.approx(expected)
     assert 0 < metrics["success"].low < 1 / 3 < metrics["success"].high < 1
     assert metrics["final_distance_cm"].low < 10.0 < metrics["final_distance_cm"].high
-    assert result.why_counts == {"planned": 3, "out of time": 3}
+    assert result.reason_counts == {"planned": 3, "out of time": 3}
     assert result.unreachable.tolist() == [0, 0, 2]
     reached_late = (fake(0.2, 0.04, 0.1, 0.03, 0.02), fake(0.2, 0.1, 0.04, 0.04, 0.04), fake(0.2, 0.01, 0.2, 0.2, 0.2))
     assert [episode.steps_needed for episode in reached_late] == [3, 2, None], "until it is done for good"

@@ -262,7 +262,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     summary = _make_summary(benchmark, verdict, options)
     cli.show(*benchmark_notes(benchmark), str(summary), *_recommend_next(summary, verdict, options))
     cli.show(*(f"Video: {file}" for file in files[1:2]))
-    return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
+    return int(any(set(result.reason_counts) == {"no finite energy"} for result in benchmark.results))
 
 
 def _require_benchmark(options: argparse.Namespace) -> None:

@@ -107,7 +107,7 @@ def _plan(options: argparse.Namespace) -> int:
     decoder = None if options.decoder is None else load_decoder(options.decoder)
     session = cli.load_planning_session(options)
     if decoder is not None:
-        decoder.require_fit(session.world_model, session.config.data, subject=options.subject)
+        decoder.require_compatible(session.world_model, session.config.data, subject=options.subject)
     request = PlanRequest(start, state, goals, mask)
     with cli.make_reporter() as reporter:
         reporter.note(_describe_search(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))

@@ -122,7 +122,7 @@ def benchmark_notes(benchmark: ClosedLoopBenchmark) -> tuple[str, ...]:
     notes = []
     for result in benchmark.results:
         decisions = counted(result.seconds.size, "decision")
-        for why, number in result.why_counts.items():
+        for why, number in result.reason_counts.items():
             if why not in _USUAL_REASONS:
                 notes.append(f"{result.policy}: {number} of {decisions}: {why}")
         if result.unreachable.any():

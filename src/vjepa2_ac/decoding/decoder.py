@@ -246,7 +246,7 @@ class TrainedDecoder:
         """Return the name and the encoder's fingerprint as plain values for JSON."""
         return {"name": self.name, "encoder": self.card.encoder}
 
-    def require_fit(self, world_model: WorldModel, data: DataConfig, *, subject: str) -> tuple[str, ...]:
+    def require_compatible(self, world_model: WorldModel, data: DataConfig, *, subject: str) -> tuple[str, ...]:
         """Refuse a model with another encoder or crop; log and return a warning if the training data differ.
 
         Args:

@@ -139,8 +139,8 @@ def describe_poor_reconstruction(card: DecoderCard, first: Image, decoded_first:
 
 def decode_views(
     decoder: Decoder, latents: Float[Tensor, "steps tokens dim"], views: int = 1
-) -> UInt8[np.ndarray, "steps size all 3"]:
-    """Decode latents to 8-bit images. With several views, tokens are concatenated and images are put side by side."""
+) -> UInt8[np.ndarray, "steps size total_width 3"]:
+    """Decode latents to 8-bit images. With several views the images are side by side."""
     images = to_pixels(decoder.decode(latents.float().reshape(len(latents) * views, -1, latents.shape[-1])))
     return np.concatenate([images[number::views] for number in range(views)], axis=2)
 
@@ -188,7 +188,7 @@ def _describe_actions(rollout: DecodedRollout) -> str:
 
 
 def _describe_action(action: Float[np.ndarray, " action_dim"]) -> str:
-    """Return a description of a change of the pose, such as "left 2.0, up 1.0 cm, close"; empty for vectors."""
+    """Return a description of a change of the pose, such as "left 2.0, up 1.0 cm, close"; "" for other actions."""
     if len(action) != _POSE:
         return ""
     components = []
@@ -232,8 +232,8 @@ def write_rollouts(comparison: RolloutComparison, folder: Path, *, reporter: Rep
 class ValidationStrip:
     """A training hook that draws an image strip at each validation, with predictions of the base and the current model.
 
-    The clip is always the one with the most motion among the validation clips (of rank 0). An error while drawing does
-    not end the run: it is logged as a warning, and there is no strip.
+    The clip is always the one with the most motion among the validation clips of the first process. An error while
+    drawing does not end the run: it is logged as a warning, and there is no strip.
 
     Args:
         config: Config of the run, with `validation.decoder`.
@@ -248,13 +248,13 @@ class ValidationStrip:
         self._clip: tuple[Batch, int, LatentBatch] | None = None  # the batch of the clip, its row, and its latents
         self._frames: UInt8[np.ndarray, "time size size 3"] | None = None  # the clip's true frames, read once
 
-    def require_fit(self, world_model: WorldModel, config: Config) -> None:
+    def require_compatible(self, world_model: WorldModel, config: Config) -> None:
         """Refuse a decoder for another encoder or crop.
 
         Raises:
             InputError: The decoder does not fit the model.
         """
-        self._decoder.require_fit(world_model, config.data, subject=config.model.base)
+        self._decoder.require_compatible(world_model, config.data, subject=config.model.base)
 
     def update(self, dataset: Dataset, batch: Batch, encoded: LatentBatch) -> None:
         """Select the clip with the most motion among this batch of validation clips and earlier batches."""

@@ -84,7 +84,7 @@ def load_models(
     require_widths(world_model, dataset.widths, where=name)
     notes = list(subject.warnings)
     if decoder is not None:
-        notes += decoder.require_fit(world_model, config.data, subject=name)
+        notes += decoder.require_compatible(world_model, config.data, subject=name)
     against = options.against if options.against is not None else (BASE,) * is_of_run
     if is_base:  # the subject is the base model, which is measured only once
         against = tuple(other for other in against if other != BASE)

@@ -104,7 +104,7 @@ def imagine_image(session: Subject, options: ImagineOptions, observation: ImageO
     require_single_process()
     model, config = session.world_model, session.config
     decoder = load_decoder(options.decoder)
-    warnings = decoder.require_fit(model, config.data, subject=session.name)
+    warnings = decoder.require_compatible(model, config.data, subject=session.name)
     decoder.to(model.device)
     space = get_state_space(config.data, len(observation.state))
     _require_directions(space, where="--state")

@@ -33,7 +33,7 @@ from vjepa2_ac.evaluation.result import (
 from vjepa2_ac.intervals import Estimate
 
 _Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]  # null in JSON: NaN
-_MOST_HORIZONS = 8  # number of horizons in the console's tables, in addition to the first
+_MAX_HORIZONS = 8  # maximum number of horizons in the console's tables, in addition to the first
 _SIMILARITIES = {"psnr_db": ("PSNR (dB)", ".1f"), "ssim": ("SSIM", ".3f")}
 _REGIONS = {"whole": "whole image", "moving": "moving region"}
 _GAIN: dict[str, Any] = {"form": ".1%", "better": "higher", "chance": 0.0}
@@ -41,7 +41,7 @@ _GAIN: dict[str, Any] = {"form": ".1%", "better": "higher", "chance": 0.0}
 
 @dataclass(frozen=True)
 class Row:
-    """One number of an evaluation with its interval, for one cell of a table."""
+    """One number of an evaluation with its interval. Rows with the same key are one line of a table."""
 
     group: str  # title of the table
     name: str  # label of the line
@@ -142,7 +142,7 @@ class _Rows(list[Row]):
     def add_errors(self) -> None:
         """Add the rollout errors relative to persistence, and the gains over the base model, paired by clip."""
         last = self.evaluation.horizon
-        every = -(-last // _MOST_HORIZONS)
+        every = -(-last // _MAX_HORIZONS)
         for metric in self.evaluation.metrics:
             shown = {1, *range(every, last + 1, every), last} if metric is L1 else {last}
             curves = {name: over_persistence(errors, "rollout", metric) for name, errors in self.errors.items()}
@@ -225,9 +225,11 @@ class _Rows(list[Row]):
         group = "Action-ranking error: fraction of alternative actions with a lower energy than the true action"
         style: dict[str, Any] = {"form": ".1%", "chance": 0.5}
         self.add_line(group, "all alternatives", "ranking.rank", {model: ranking.rank}, **style)
-        self.add_line(group, "alternatives from the box of actions", "ranking.box", {model: ranking.box}, **style)
         self.add_line(
-            group, "alternatives as long as the true action", "ranking.shell", {model: ranking.shell}, **style
+            group, "alternatives drawn within the range of actions", "ranking.box", {model: ranking.box}, **style
+        )
+        self.add_line(
+            group, "alternatives with the length of the true action", "ranking.shell", {model: ranking.shell}, **style
         )
         for key, label, estimate in (
             ("change", "change of the prediction with the action, relative to persistence", ranking.change),

@@ -187,26 +187,28 @@ def make_variants(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
             _change_frames(lambda frames: frames[:, :, ::-1]),
         )
         repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
-        variants.append(_make_variant("red and blue exchanged", repair, exchanged, has_frames=True))
+        variants.append(_make_variant("red and blue exchanged", repair, exchanged, changes_frames=True))
         repair = "flip the frames, left to right, where the data is written"
-        variants.append(_make_variant("frames mirrored", repair, flipped, has_frames=True))
+        variants.append(_make_variant("frames mirrored", repair, flipped, changes_frames=True))
     return variants
 
 
-def _make_variant(name: str, repair: str, change: Callable[[Episode], Episode], *, has_frames: bool = False) -> Variant:
-    """Return a variant that changes each episode. Without `has_frames` the frames are not read."""
+def _make_variant(
+    name: str, repair: str, change: Callable[[Episode], Episode], *, changes_frames: bool = False
+) -> Variant:
+    """Return a variant that changes each episode. Without `changes_frames` the frames are not read."""
 
     def no_frames(steps: Sequence[int]) -> np.ndarray:
         return np.zeros((len(steps), 1, 1, 3), np.uint8)
 
     def change_episode(episode: Episode) -> Episode:
         changed = change(episode)
-        return changed if has_frames else replace(changed, read_frames=no_frames, read_latents=None)
+        return changed if changes_frames else replace(changed, read_frames=no_frames, read_latents=None)
 
     def view(dataset: Dataset) -> Dataset:
         return replace(dataset, source=ReadOnce(dataset.source, change_episode))
 
-    return Variant(name, view, has_frames, repair)
+    return Variant(name, view, changes_frames, repair)
 
 
 def mirror_poses(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarray, "steps 7"]:

@@ -39,7 +39,7 @@ from vjepa2_ac.storage.structured import to_plain
 
 Encode = Callable[[Batch], LatentBatch]  # encodes pixels into latents, on the model's device
 
-_MARGIN = 2.0  # required distance from 0 in half-widths of the 95 % interval, because the best of several is selected
+_MARGIN = 2.0  # a difference must be below 0 by this many half-widths of its interval: the best of several is selected
 _MIN_EPISODES_FOR_INTERVAL = 2
 _MIN_EPISODES_TO_BE_CERTAIN = 10  # intervals from fewer episodes are too narrow
 
@@ -50,7 +50,7 @@ class Variant:
 
     name: str
     view: Callable[[Dataset], Dataset]  # returns the changed data set
-    has_frames: bool = True  # False: the frames are those of the first variant, whose latents are then used
+    changes_frames: bool = True  # False: the frames equal those of the first variant, so its latents are used
     repair: str = ""  # how to correct the data if the model predicts this variant better
 
 
@@ -144,7 +144,7 @@ def _read_variant(
 ) -> Iterable[LatentBatch]:
     """Yield the batch of a variant's clips. Frames are encoded only if the variant changes them."""
     for batch in read_batches(variant.view(dataset), windows, batch_size=len(windows)):
-        if variant.has_frames:
+        if variant.changes_frames:
             yield encode(batch)
         else:
             device = latents.states.device
@@ -195,9 +195,7 @@ def load_named(config: Config, dataset: Dataset, model: str | None) -> WorldMode
     """
     if model is None and config.model.is_random:
         needed = "a trained model, because the stride is selected by its error"
-        fix = (
-            "Set data.stride to a number, or set model.base to a trained model (data calibrate: pass one with --model)"
-        )
+        fix = "Set data.stride to a number, or set model.base to a trained model (for data calibrate: --model MODEL)"
         raise InputError(where="model.base: random", found="a random model", needed=needed, fix=fix)
     if model is None:
         loaded = load_base(config.model, seed=config.seed)

@@ -1,7 +1,7 @@
 """Offline comparison of policies: the energy of their action chunks at frames of held-out episodes.
 
-The goal of a chunk of N model steps is the demonstration's frame N model steps later. A policy that imitates the
-demonstration therefore scores well. The score does not show whether a policy finds a better solution.
+For a chunk of N model steps, the goal is the frame of the demonstration that comes N model steps later. A policy that
+imitates the demonstration therefore scores well. The score does not show whether a policy finds a better solution.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class PolicyScore:
 
     name: str
     mean: Estimate  # over all chunks at an evaluation point
-    best: Estimate  # of the chunk with the lowest energy at each evaluation point, which the model would select
-    behind: Estimate | None  # `mean` minus that of the next better policy; None: this policy is the best
+    best: Estimate  # score of the chunk that the model would select at each evaluation point, with the lowest energy
+    behind: Estimate | None  # `mean` minus `mean` of the next better policy; None: this policy is the best
 
 
 @dataclass(frozen=True)
@@ -115,10 +115,10 @@ def changes_of_chunks(
 
     Args:
         chunks: Actions of the policy, chunks x control steps x dim: poses in metres, radians and gripper position, or
-            vectors.
+            states in another space.
         state: The current state of the robot.
-        form: Meaning of the numbers.
-        control_steps: Chunk steps per model step: `data.stride` if policy and data have the same rate.
+        form: Whether the chunks contain targets, deltas or offsets.
+        control_steps: Steps of a chunk per model step: `data.stride` if policy and data have the same rate.
         space: Meaning of a state.
 
     Raises:
@@ -132,7 +132,7 @@ def changes_of_chunks(
         needed = f"finite numbers, chunks x control steps x {len(space)}: {', '.join(space.names)}"
         raise InputError(where="chunks", found=f"an array with shape {values.shape}", needed=needed)
     if values.shape[1] < control_steps:
-        needed = f"at least {control_steps}, the control steps of one model step"
+        needed = f"at least {control_steps} control steps (one model step)"
         raise InputError(where="chunks", found=counted(values.shape[1], "control step"), needed=needed)
     current, changes = torch.from_numpy(state), torch.from_numpy(values)
     if form == "deltas":
@@ -187,8 +187,8 @@ def score_policies(
         controller: The controller of the model that scores; its goals are replaced.
         dataset: The data set with the episodes.
         policies: One or more policies.
-        form: Meaning of the numbers of the chunks.
-        control_steps: Chunk steps per model step; None: the stride of the data.
+        form: Whether the chunks contain targets, deltas or offsets.
+        control_steps: Steps of a chunk per model step; None: the stride of the data.
         progress: Called with (done, total) in evaluation points.
 
     Raises:

@@ -3,7 +3,7 @@
 RUN/config.yaml         the resolved config, including defaults and a calibrated stride
 RUN/environment.json    versions, machine, command and working directory of every start
 RUN/calibration.json    metrics of each stride, if data.stride was auto
-RUN/changes.json        99th percentile of state changes per model step, for the value `data` in planning.limits
+RUN/changes.json        99th percentile of state changes per model step, for limits that are set to `data`
 RUN/run_id              the unique id of the run
 RUN/metrics.jsonl       metrics, one JSON object per line
 RUN/metrics.json        metrics from `evaluate`, displayed in report.html and evaluation.png
@@ -12,7 +12,7 @@ RUN/tensorboard/        TensorBoard event files
 RUN/wandb/              files of Weights & Biases
 RUN/imagined/           predicted frames at each validation, if `validation.decoder` is set; and videos of `imagine`
 RUN/.mirror/            links to the files that are being uploaded to checkpoint.remote, during the upload
-RUN/.lock               a kernel lock, held by the training process until it ends, even if it is killed
+RUN/.lock               a kernel lock of the training process, released when it ends, also if it is killed
 """
 
 from __future__ import annotations
@@ -116,16 +116,15 @@ def open_run_folder(config: Config, run_id: str, *, allow_config_change: bool = 
     check_run_folder(config, allow_config_change=allow_config_change)
     folder = Path(config.run_dir)
     start = {"seed": config.seed, "folder": str(Path.cwd()), **environment()}
-    if changes := write_config(config):  # the first file, because a folder with a config is recognised as a run
+    if changes := write_config(config):  # written first, because a folder with a config is recognised as a run
         start["config_changes"] = changes
     path = folder / ENVIRONMENT
     write_atomically(path, json.dumps([*_earlier_starts(path), start], indent=1).encode())
     write_atomically(folder / RUN_ID, run_id)
     (folder / CHECKPOINTS).mkdir(exist_ok=True)
     remove_incomplete(folder / CHECKPOINTS)
-    shutil.rmtree(
-        folder / UPLOAD_LINKS, ignore_errors=True
-    )  # with them, deleted checkpoints would still use disk space
+    # A deleted checkpoint uses disk space as long as links to its files exist.
+    shutil.rmtree(folder / UPLOAD_LINKS, ignore_errors=True)
     return folder
 
 
@@ -133,7 +132,8 @@ def read_or_create_run_id(folder: Path) -> str:
     """Return the id of the run in a folder, or a new random id.
 
     Raises:
-        InputError: The file does not contain a valid id; trackers use the id in paths.
+        InputError: The file does not contain a valid id. Its characters are restricted, because trackers use it in
+            paths.
     """
     path = folder / RUN_ID
     if not path.is_file():
@@ -156,7 +156,7 @@ def write_config(config: Config) -> list[str]:
 
 
 def has_same_results(config: Config) -> bool:
-    """Return whether a config changes neither the computation, the measurements nor the paths of its run."""
+    """Return whether a config has the computation, the measurements and the paths of the stored config of its run."""
     changed = changed_keys(read_run_config(Path(config.run_dir)), config)
     return not any(key in _PATHS or (Affects.RUN | Affects.MEASURED) & get_effect(key, Config) for key in changed)
 
@@ -205,10 +205,10 @@ def read_run_config(folder: Path, overrides: Iterable[str] = ()) -> Config:
 
 
 def _resolve_missing_paths(config: Config, folder: Path) -> Iterator[tuple[str, str]]:
-    """Yield key and absolute path of each missing relative path that exists in an earlier working directory."""
+    """Yield key and absolute path of relative paths that exist only in the working directory of an earlier start."""
     flat = config_as_flat_dict(config)
     data_sets = zip(("data", "replay.data"), config.data_sets, strict=False)
-    unread = {f"{name}.idle.ranges" for name, data in data_sets if data.is_cache}  # not read from a cache
+    unread = {f"{name}.idle.ranges" for name, data in data_sets if data.is_cache}  # not needed by a latent cache
     starts = [str(start.get("folder")) for start in reversed(_earlier_starts(folder / ENVIRONMENT))]
     for key in _PATHS:
         path = flat.get(key)
@@ -260,7 +260,7 @@ def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
 
 
 def with_values_of_run(config: Config) -> Config:
-    """Return the config with values that the run in its folder has fixed.
+    """Return the config with the values that were decided at the start of its run.
 
     These are the calibrated stride, if `data.stride` is auto, and `data.splits`, if the config does not set it. So
     a run of an earlier version keeps the splits that it started with.

@@ -352,7 +352,7 @@ def write_benchmark(benchmark: ClosedLoopBenchmark, folder: Path, verdict: Mappi
 def _metrics(result: ClosedLoopResult) -> dict[str, Any]:
     return {
         **{name: None if estimate is None else estimate.as_dict() for name, estimate in result.estimates.items()},
-        "why_counts": result.why_counts,
+        "why_counts": result.reason_counts,
         "unreachable_commands": int(result.unreachable.sum()),
         "by_episode": {
             "success": result.successes.tolist(),

@@ -82,7 +82,7 @@ class Policy(Protocol):
     why: str  # reason for the last action, from a small set, so that reasons can be counted
 
     def reset(self, trial: Trial, goal_image: Image) -> None:
-        """Start an episode. Only an oracle uses more of the trial than its images."""
+        """Start an episode. Policies other than the oracle use only the goal image and the sub-goals of the trial."""
 
     def act(self, observation: Observation) -> Action | None:
         """Return the action of the next model step, in the base frame; None: the environment's expert acts."""
@@ -132,7 +132,7 @@ class EpisodeResult:
     distances_m: Float[np.ndarray, " time"]  # distance to the goal, of the flange or of the block
     reached: Bool[np.ndarray, " time"]  # whether the task is done, see `TaskProblem.succeeded`
     seconds: Float[np.ndarray, " steps"]  # duration of each decision
-    whys: tuple[str, ...]  # reason for each action
+    reasons: tuple[str, ...]  # reason for each action
     unreachable: int  # number of commands that the arm could not follow completely
     goal_image: Image
     frames: UInt8[np.ndarray, "time height width 3"] | None  # if they are stored
@@ -193,7 +193,7 @@ def run_trial(
         distances_m=np.array([info["distance_m"] for info in infos]),
         reached=np.array([info["success"] for info in infos]),
         seconds=np.array([step.seconds for step in steps[1:]]),
-        whys=tuple(step.why for step in steps[1:]),
+        reasons=tuple(step.why for step in steps[1:]),
         unreachable=sum(not info.get("is_reachable", True) for info in infos),
         goal_image=observations[-1].image if goal_image is None else goal_image,
         frames=np.stack([observation.image for observation in observations]) if keep_frames else None,
@@ -207,7 +207,7 @@ class ArmEnvironment:
     """The simulated arm as an environment.
 
     Args:
-        arm: An arm from `arm_for` with the task and domain of the problems. Its pose is changed.
+        arm: An arm from `arm_for` with the task and domain of the problems. The environment changes its pose.
     """
 
     def __init__(self, arm: SimulatedArm) -> None:
@@ -350,9 +350,9 @@ class ClosedLoopResult:
         return estimate_share(int(self.successes.sum()), len(self.episodes))
 
     @property
-    def why_counts(self) -> dict[str, int]:
+    def reason_counts(self) -> dict[str, int]:
         """Number of actions by reason, the most common reason first."""
-        return dict(Counter(why for episode in self.episodes for why in episode.whys).most_common())
+        return dict(Counter(why for episode in self.episodes for why in episode.reasons).most_common())
 
     @property
     def estimates(self) -> dict[str, Estimate | None]:

@@ -97,7 +97,7 @@ def set_up(
     run_on_first(accelerator, lambda: require_same_base(config, base))
     get_extrinsics(base, clip)
     if image_strip is not None:
-        image_strip.require_fit(base, config)
+        image_strip.require_compatible(base, config)
     _require_shared_memory(config, clip, base.sizes, accelerator)
     for replayed in replay_datasets:
         get_extrinsics(base, first_clip(replayed))
