@@ -82,9 +82,9 @@ def sizes_of(run: Path) -> ModelSizes:
 @pytest.mark.parametrize("kind", ["lora", "none"])
 def test_official_export_predicts_as_the_run(trained, tmp_path: Path, kind: str) -> None:
     run = trained(adapter__kind=kind)
-    written = export_run(run, tmp_path / "out.pt", "official").path
-    assert written == tmp_path / "out.pt"
-    assert_predicts_as(load_official(written, sizes_of(run)), run)
+    exported_path = export_run(run, tmp_path / "out.pt", "official").path
+    assert exported_path == tmp_path / "out.pt"
+    assert_predicts_as(load_official(exported_path, sizes_of(run)), run)
 
 
 def test_merged_export_predicts_as_the_run(trained, tmp_path: Path) -> None:

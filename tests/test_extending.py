@@ -11,7 +11,7 @@ import yaml
 from PIL import Image
 
 from installing import leave_package
-from killable import nursery
+from killable import fork_server
 from paths import ROOT
 from run_fixtures import as_yaml
 
@@ -37,7 +37,7 @@ def plugin_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def command(*words: str) -> subprocess.CompletedProcess[str]:
     """Run a command in a process of its own, without the working directory on the path."""
-    return nursery().run("-m", "vjepa2_ac.cli", *words, folder=Path.cwd().parent)
+    return fork_server().run("-m", "vjepa2_ac.cli", *words, folder=Path.cwd().parent)
 
 
 def test_training_imports_core_packages_only() -> None:
@@ -113,7 +113,7 @@ def installed(plugin_folder: Path, entry_points: str, code: str, *words: str) ->
     leave_package(plugin_folder / "site", "my_package", entry_points, code)
     program = plugin_folder.parent / "program.py"
     program.write_text("import sys; sys.path.append('site'); from vjepa2_ac.cli import main; sys.exit(main())")
-    return nursery().run(str(program), *words, folder=plugin_folder.parent)
+    return fork_server().run(str(program), *words, folder=plugin_folder.parent)
 
 
 def test_installed_plugin_is_found_by_its_entry_point(plugin_folder: Path, make_config) -> None:

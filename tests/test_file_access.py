@@ -84,15 +84,15 @@ CACHED = "index/key.index"  # a damaged index is built again instead of raising
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def original_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("written")
     write_all(root)
     return root
 
 
 @pytest.fixture
-def files(written: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(written, tmp_path / "files")
+def files(original_files: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(original_files, tmp_path / "files")
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -109,9 +109,9 @@ class Pods:
 
     def wait_until(self, happened: Callable[[], object]) -> None:
         """Wait, and restart failed pods, as the job's controller does."""
-        until = time.monotonic() + 200
+        deadline_s = time.monotonic() + 200
         while not happened():
-            assert time.monotonic() < until, [pod.written() for pod in self.running]
+            assert time.monotonic() < deadline_s, [pod.read_outputs() for pod in self.running]
             for index, pod in enumerate(self.running):
                 if pod.poll():
                     self.running[index] = self._start(index)

@@ -44,9 +44,9 @@ def test_vector_states_are_the_stored_numbers_and_actions_their_differences(tmp_
     dataset = open_dataset(vector_config(write_vectors(tmp_path, width=width)))
     assert dataset.widths == Widths(width, width)
     clip = clip_at(dataset, 0, 3)
-    written = vectors(24, width, seed=0)
-    np.testing.assert_array_equal(clip.states, written[[3, 5, 7]].astype(np.float32))
-    np.testing.assert_array_equal(clip.actions, (written[[5, 7]] - written[[3, 5]]).astype(np.float32))
+    states = vectors(24, width, seed=0)
+    np.testing.assert_array_equal(clip.states, states[[3, 5, 7]].astype(np.float32))
+    np.testing.assert_array_equal(clip.actions, (states[[5, 7]] - states[[3, 5]]).astype(np.float32))
 
 
 @pytest.mark.parametrize(("operation", "join"), [("sum", np.sum), ("mean", np.mean), ("last", lambda x, **_: x[:, -1])])
@@ -56,8 +56,8 @@ def test_commands_of_a_model_step_are_joined_control_steps(
     dataset = open_dataset(vector_config(write_vectors(tmp_path, width=14, action_width=5), **join_recorded(operation)))
     assert dataset.widths == Widths(14, 5)
     clip = clip_at(dataset, 1, 4)
-    written = vectors(24, 5, seed=1001)  # of control steps 4, 5 and 6, 7
-    np.testing.assert_array_equal(clip.actions, join(written[4:8].reshape(2, 2, 5), axis=1).astype(np.float32))
+    states = vectors(24, 5, seed=1001)  # of control steps 4, 5 and 6, 7
+    np.testing.assert_array_equal(clip.actions, join(states[4:8].reshape(2, 2, 5), axis=1).astype(np.float32))
 
 
 def test_rlds_reads_the_configured_features(droid: Path) -> None:

@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file
 
 from decoders import EncodeSplit
-from killable import KILLED, Nursery
+from killable import KILLED, ForkServer
 from run_fixtures import TINY, MakeConfig, SilentReporter, as_yaml
 from vjepa2_ac.config import DecoderConfig, ModelSizes
 from vjepa2_ac.decoding import training
@@ -72,14 +72,14 @@ def test_stopped_training_resumes_exactly(
 
 
 def test_killed_training_resumes_exactly(
-    nursery: Nursery, make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path
+    fork_server: ForkServer, make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "config.yaml").write_text(as_yaml(make_decoder()))
     out = tmp_path / "decoder"
     command = ("decoder", str(tmp_path / "config.yaml"))
     for die_at in (12, 35):  # while frames are encoded, and between checkpoints
-        assert nursery.start(*command, folder=str(out), die_at=die_at).wait() == KILLED  # type: ignore[arg-type]
-    assert nursery.start(*command, folder=str(out)).wait() == 0  # type: ignore[arg-type]
+        assert fork_server.start(*command, folder=str(out), die_at=die_at).wait() == KILLED  # type: ignore[arg-type]
+    assert fork_server.start(*command, folder=str(out)).wait() == 0  # type: ignore[arg-type]
     assert_same_decoder(out, whole_decoder)
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from gcs import Gcs
-from killable import KILLED, Nursery
+from killable import KILLED, ForkServer
 from run_fixtures import MakeConfig, SilentReporter, as_yaml, set_up
 from same_run import assert_same_run
 from vjepa2_ac import storage
@@ -185,25 +185,29 @@ def test_damaged_bucket_file_is_reported_and_encoded_again(
 # ---- several and killed processes -------------------------------------------------------------------------------
 
 
-def start_encoding(nursery: Nursery, config: Config, folder: Path) -> object:
+def start_encoding(fork_server: ForkServer, config: Config, folder: Path) -> object:
     """Start `vjepa2-ac encode` in a separate process."""
     path, out, err = folder / "config.yaml", folder / "out.txt", folder / "err.txt"
     path.write_text(as_yaml(config))
     out.touch()
     err.touch()
     command = ("-m", "vjepa2_ac.cli", "encode", str(path))
-    return nursery.start_script(*command, environment=dict(os.environ), out=str(out), err=str(err))
+    return fork_server.start_script(*command, environment=dict(os.environ), out=str(out), err=str(err))
 
 
 def test_killed_upload_leaves_no_finished_file(
-    bucket: Gcs, bucket_config: Callable[..., Config], nursery: Nursery, tmp_path: Path, encoded_frames: list[int]
+    bucket: Gcs,
+    bucket_config: Callable[..., Config],
+    fork_server: ForkServer,
+    tmp_path: Path,
+    encoded_frames: list[int],
 ) -> None:
     expected = batches(
         open_cache_only(bucket_config(), encode_config(bucket_config(data__cache_dir=str(tmp_path / "whole"))).folder)
     )
     encoded_frames.clear()
     bucket.fail_next("hang", times=ALWAYS, match=r"POST /upload/.*00000[3-7]-")
-    child = start_encoding(nursery, bucket_config("two"), tmp_path)
+    child = start_encoding(fork_server, bucket_config("two"), tmp_path)
     while bucket.faults_left == ALWAYS or len(latents_in(bucket)) < 3:  # during the fourth upload
         assert child.is_running()
         time.sleep(0.01)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from killable import KILLED, Nursery
+from killable import KILLED, ForkServer
 from latent_sets import NUMBERS, contents, latents_in, opened, write_cache
 from ranks import finish, free_port, start_rank
 from run_fixtures import MakeConfig, SilentReporter, as_yaml
@@ -60,7 +60,7 @@ def test_each_needed_frame_is_encoded_once(
 
 
 def test_kill_loses_at_most_one_episode(
-    nursery: Nursery, make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
+    fork_server: ForkServer, make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
 ) -> None:
     config = make_config(data__start_every=2)
     (tmp_path / "config.yaml").write_text(as_yaml(config))
@@ -68,7 +68,7 @@ def test_kill_loses_at_most_one_episode(
     expected, out, num_files = contents(tmp_path / "whole"), tmp_path / "out", 0
     command = ("encode", str(tmp_path / "config.yaml"), "--out", str(out))
     for die_at in (2, 9, 13, 16):
-        assert nursery.start(*command, folder=out, die_at=die_at).wait() == KILLED
+        assert fork_server.start(*command, folder=out, die_at=die_at).wait() == KILLED
         files = [path for path in latents_in(out) if not path.name.startswith(".")]
         assert all(opened(path) == expected[str(path.relative_to(out))] for path in files)
         assert num_files <= len(files) < 8

@@ -58,9 +58,9 @@ def test_console_page_and_file_show_the_same_rows(tmp_path: Path) -> None:
         assert str(row) in page, row
         assert row.detail or str(row) in shown, row
     write_metrics(EVALUATION, tmp_path / METRICS_FILE)
-    written = read_metrics(tmp_path)
-    assert [(row.key, row.model) for row in written.rows] == [(row.key, row.model) for row in rows]
-    stored_row = written.of("rollout.l1.over_persistence.3")
+    stored_metrics = read_metrics(tmp_path)
+    assert [(row.key, row.model) for row in stored_metrics.rows] == [(row.key, row.model) for row in rows]
+    stored_row = stored_metrics.of("rollout.l1.over_persistence.3")
     assert stored_row is not None
     row = next(row for row in rows if (row.key, row.model) == (stored_row.key, stored_row.model))
     assert Estimate(stored_row.value or 0, stored_row.low or 0, stored_row.high or 0) == row.estimate

@@ -16,7 +16,7 @@ from windows import header
 def test_explore_without_arguments_shows_the_packages_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     process = Rank(["-m", "vjepa2_ac.cli", "explore", "--port", "0"], dict(os.environ))
-    (url,) = wait_until(lambda: re.findall(r"The page: (\S+)\s", process.written()[0]), [process])
+    (url,) = wait_until(lambda: re.findall(r"The page: (\S+)\s", process.read_outputs()[0]), [process])
     with connect(url.replace("http", "ws") + "socket", origin=url.rstrip("/"), max_size=None) as page:  # type: ignore[arg-type]
         content = header(page.recv(timeout=60))
     assert (content["subject"], content["truth"]) == ("builtin:sim-tiny", "simulated")

@@ -327,7 +327,7 @@ def test_rollouts_without_pyav_are_written_as_gif_with_a_note(tmp_path: Path, mo
     ):
         monkeypatch.setattr(imagine, name, lambda *_, value=value, **__: value)
     monkeypatch.setattr(imagine, "make_strip", lambda _: {})
-    written = imagine.write_rollouts(None, tmp_path, reporter=SimpleNamespace(note=notes.append))  # type: ignore[arg-type]
-    assert imagine.VIDEO not in {path.name for path in written}
-    assert all(path.is_file() for path in written)
+    paths = imagine.write_rollouts(None, tmp_path, reporter=SimpleNamespace(note=notes.append))  # type: ignore[arg-type]
+    assert imagine.VIDEO not in {path.name for path in paths}
+    assert all(path.is_file() for path in paths)
     assert "pip install" in notes[0]

@@ -199,9 +199,9 @@ def test_unmeasured_parts_are_listed_with_the_reason() -> None:
         assert f"{part}: not measured." in shown
     assert "Energy landscapes: not measured. --ranking-clips is 0: no" in shown
     assert "`" not in shown, "a command is shown as code"
-    written = metrics_as_dict(noted)["not_measured"]
-    assert len(written) == 5
-    assert all(reason.replace("`", "") in shown for reason in written.values()), "page and metrics.json agree"
+    reasons = metrics_as_dict(noted)["not_measured"]
+    assert len(reasons) == 5
+    assert all(reason.replace("`", "") in shown for reason in reasons.values()), "page and metrics.json agree"
     assert "No video: vjepa2-ac evaluate runs/kitchen --decoder FOLDER" in shown
 
 

@@ -140,10 +140,10 @@ def test_numpy_recomputes_every_number_of_the_summary_from_metrics_json(with_bas
 
 
 def test_the_conclusions_follow_from_paired_differences_in_metrics_json(tmp_path: Path) -> None:
-    written, metrics = measured(tmp_path, with_base=True)["models"], read_metrics(tmp_path)
-    ranks, base_ranks = (written[name]["ranking"]["ranks"] for name in ("adapter", "base"))
-    ids = written["adapter"]["ranking"]["episode_ids"]
-    maps, base_maps = (written[name]["landscapes"]["maps"] for name in ("adapter", "base"))
+    models, metrics = measured(tmp_path, with_base=True)["models"], read_metrics(tmp_path)
+    ranks, base_ranks = (models[name]["ranking"]["ranks"] for name in ("adapter", "base"))
+    ids = models["adapter"]["ranking"]["episode_ids"]
+    maps, base_maps = (models[name]["landscapes"]["maps"] for name in ("adapter", "base"))
     distances = [
         math.dist(energy_map["minimum"], energy_map["true"]) - math.dist(base_map["minimum"], base_map["true"])
         for energy_map, base_map in zip(maps, base_maps, strict=True)

@@ -231,11 +231,11 @@ def test_checkpoint_is_synced_before_an_older_one_is_removed(tmp_path, monkeypat
     monkeypatch.setattr(os, "fsync", record_calls("flush", os.fsync))
     monkeypatch.setattr(os, "rename", record_calls("rename", os.rename))
     monkeypatch.setattr(shutil, "rmtree", record_calls("remove", shutil.rmtree))
-    written = write(tmp_path, 20, keep=1)
+    stored = write(tmp_path, 20, keep=1)
     temporary = f".writing-{checkpoint_name(20)}"
     renamed = events.index(f"rename {temporary}")
-    parts = [written, *written.rglob("*")]
-    assert {f"flush {temporary}/{part.relative_to(written)}".removesuffix("/.") for part in parts} < set(
+    parts = [stored, *stored.rglob("*")]
+    assert {f"flush {temporary}/{part.relative_to(stored)}".removesuffix("/.") for part in parts} < set(
         events[:renamed]
     )
     assert events[renamed + 1 :] == ["flush .", f"remove {checkpoint_name(10)}"]
@@ -280,17 +280,17 @@ def test_checkpoint_contains_trained_weights_and_not_the_frozen_base(make_config
     trained = sum(value.numel() for value in model.parameters() if value.requires_grad)
     state = torch.load(checkpoint / "optimizer.pt", weights_only=True)["state"].values()
     assert sum(moments[name].numel() for moments in state for name in ("exp_avg", "exp_avg_sq")) == 2 * trained
-    written = {path.name: load_file(path) for path in checkpoint.rglob("*.safetensors")}
+    stored = {path.name: load_file(path) for path in checkpoint.rglob("*.safetensors")}
     if config.adapter.kind == "none":
-        assert {name: value.keys() for name, value in written.items()} == {
+        assert {name: value.keys() for name, value in stored.items()} == {
             "predictor.safetensors": model.predictor.state_dict().keys()
         }
         return
-    for weights in written.values():
+    for weights in stored.values():
         assert sum(value.numel() for value in weights.values()) == trained
         assert all(re.search(r"\.lora_[AB]|\.action_encoder\.", name) for name in weights)
     other_bytes = sum(
-        path.stat().st_size for path in checkpoint.rglob("*") if path.name not in {*written, "optimizer.pt"}
+        path.stat().st_size for path in checkpoint.rglob("*") if path.name not in {*stored, "optimizer.pt"}
     )
     assert other_bytes < 20_000, "all other files are small text files"
 

@@ -148,10 +148,10 @@ def test_resumed_run_continues_the_same_offline_wandb_run(tmp_path: Path) -> Non
         trackers.log("train", first_step + 1, {"loss": 0.25})
         trackers.close()
     files = list((tmp_path / "wandb").glob("offline-run-*-abc123/run-abc123.wandb"))
-    written = b"".join(path.read_bytes() for path in files)
-    assert written.count(b"train/loss") >= 2
+    content = b"".join(path.read_bytes() for path in files)
+    assert content.count(b"train/loss") >= 2
     for text in (b"arms", b"training.learning_rate", b"adapter.rank"):
-        assert text in written
+        assert text in content
 
 
 def test_resumed_run_continues_the_same_trackio_run(tmp_path: Path) -> None:

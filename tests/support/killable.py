@@ -1,7 +1,7 @@
 """Processes that start at once, and runs killed with SIGKILL at chosen moments.
 
-Starting Python with PyTorch takes seconds. A `Nursery` is a single-threaded process that has imported all libraries. It
-forks a child for each start, which runs the command line and exits like any other process.
+Starting Python with PyTorch takes seconds. A `ForkServer` is a single-threaded process that has imported all libraries.
+It forks a child for each start, which runs the command line and exits like any other process.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from vjepa2_ac import process as output
 KILLED = -signal.SIGKILL
 
 
-class Nursery:
+class ForkServer:
     """Starts commands of `vjepa2-ac`, or scripts, each in a process of its own."""
 
     def __init__(self) -> None:
@@ -76,14 +76,14 @@ class Nursery:
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
         reply = self._process.stdout.readline()
-        assert reply, "the nursery is gone"
+        assert reply, "the fork server has exited"
         return int(reply)
 
 
 @cache
-def nursery() -> Nursery:
-    """Return the nursery of this test process, which exists until the process exits."""
-    process = Nursery()
+def fork_server() -> ForkServer:
+    """Return the fork server of this test process, which exists until the process exits."""
+    process = ForkServer()
     atexit.register(process.close)
     return process
 
@@ -93,7 +93,7 @@ class Child:
     """A command that is running."""
 
     pid: int
-    nursery: Nursery
+    fork_server: ForkServer
 
     def is_running(self) -> bool:
         try:
@@ -102,12 +102,12 @@ class Child:
             return False
 
     def wait(self) -> int:
-        return self.nursery.wait_for(self.pid)
+        return self.fork_server.wait_for(self.pid)
 
     def kill_after(self, delay_s: float) -> int:
         """Kill the child after a delay; return its exit status, which is not KILLED if it exited earlier."""
-        until = time.monotonic() + delay_s
-        while time.monotonic() < until and self.is_running():
+        deadline_s = time.monotonic() + delay_s
+        while time.monotonic() < deadline_s and self.is_running():
             time.sleep(0.0005)
         return self.kill()
 

@@ -30,7 +30,7 @@ class Rank:
         for file in self._said:
             file.touch()
         out, err = map(str, self._said)
-        self._child = killable.nursery().start_script(*words, environment=environment, out=out, err=err)
+        self._child = killable.fork_server().start_script(*words, environment=environment, out=out, err=err)
 
     @property
     def pid(self) -> int:
@@ -50,13 +50,13 @@ class Rank:
 
     def communicate(self, timeout: float = 120.0) -> tuple[str, str]:
         """Wait for the process; return its output and error output."""
-        until = time.monotonic() + timeout
+        deadline_s = time.monotonic() + timeout
         while self.poll() is None:
-            assert time.monotonic() < until, self.written()
+            assert time.monotonic() < deadline_s, self.read_outputs()
             time.sleep(0.01)
-        return self.written()
+        return self.read_outputs()
 
-    def written(self) -> tuple[str, str]:
+    def read_outputs(self) -> tuple[str, str]:
         out, err = (file.read_text() for file in self._said)
         return out, err
 
@@ -90,9 +90,9 @@ def finish(processes: list, status: int = 0, timeout: float = 120.0) -> list[tup
 
 def wait_until(happened: Callable[[], T], processes: Sequence = (), timeout_s: float = 300.0) -> T:
     """Wait until `happened` returns a true value, and return the value; no process may exit earlier."""
-    until = time.monotonic() + timeout_s
+    deadline_s = time.monotonic() + timeout_s
     while not (outcome := happened()):
         assert all(process.poll() is None for process in processes), finish([*processes])
-        assert time.monotonic() < until
+        assert time.monotonic() < deadline_s
         time.sleep(0.02)
     return outcome

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import killable
-from killable import Nursery
+from killable import ForkServer
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
@@ -151,9 +151,9 @@ def popen() -> Iterator[Popen]:
 
 
 @pytest.fixture(scope="session")
-def nursery() -> Nursery:
+def fork_server() -> ForkServer:
     """Starts real processes without importing libraries again."""
-    return killable.nursery()
+    return killable.fork_server()
 
 
 MakeConfig = Callable[..., Config]

@@ -40,7 +40,7 @@ class ServerAddress:
 
 @contextmanager
 def run_in_thread(
-    serve: Callable[[asyncio.Event, Callable[[str], None]], Awaitable[object]], until: str
+    serve: Callable[[asyncio.Event, Callable[[str], None]], Awaitable[object]], ready_line: str
 ) -> Iterator[list[str]]:
     """Run a server during the `with` block; yield its status lines as soon as a line starts with `until`."""
     lines: list[str] = []
@@ -48,7 +48,7 @@ def run_in_thread(
 
     def print_status(line: str) -> None:
         lines.append(line)
-        if line.startswith(until):
+        if line.startswith(ready_line):
             has_started.set()
 
     async def run() -> None:
@@ -97,7 +97,9 @@ def serving(
 def start_server(*arguments: str) -> tuple[Rank, str]:
     """Start the command `serve`; return its process and its address."""
     process = Rank(["-m", "vjepa2_ac.cli", "serve", *arguments, "--port", "0"], dict(os.environ))
-    (address,) = wait_until(lambda: re.findall(r"^listening on (.+)\n", process.written()[0], re.MULTILINE), [process])
+    (address,) = wait_until(
+        lambda: re.findall(r"^listening on (.+)\n", process.read_outputs()[0], re.MULTILINE), [process]
+    )
     return process, address
 
 

@@ -135,9 +135,9 @@ def test_replay_data_set_inherits_settings_and_writes_differences(tmp_path: Path
     replayed = config.replay.data
     assert (replayed.frames, replayed.camera, replayed.stride, replayed.exclude) == (4, "wrist_left", 2, ())
     assert (replayed.fields.control_rate_hz, replayed.fields.gripper_open) == (5.0, 2.0)
-    written = config_as_dict(config)
-    assert written["replay"]["data"] == {"source": "rlds", **second, "idle": {"rule": "motion"}}
-    assert parse_config(written, where="") == config
+    config_values = config_as_dict(config)
+    assert config_values["replay"]["data"] == {"source": "rlds", **second, "idle": {"rule": "motion"}}
+    assert parse_config(config_values, where="") == config
     values["replay"]["data"] = {"source": "lerobot", "path": "two"}
     other = parse_config(values, where="").replay.data
     assert (other.frames, other.camera, other.source) == (4, None, "lerobot")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from killable import KILLED, Child, Nursery, wait_for_the_end_of
+from killable import KILLED, Child, ForkServer, wait_for_the_end_of
 from same_run import assert_same_run
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.training.loop import train
@@ -28,9 +28,9 @@ CHANGES = {
 class Killer:
     """Starts and kills runs in three modes, one after the other, and counts the kills."""
 
-    def __init__(self, nursery: Nursery, seed: int) -> None:
+    def __init__(self, fork_server: ForkServer, seed: int) -> None:
         self.kills, self.in_a_checkpoint, self.processes = 0, 0, set()
-        self._nursery, self._rng = nursery, np.random.default_rng(seed)
+        self._fork_server, self._rng = fork_server, np.random.default_rng(seed)
 
     def kill(self, config_file: Path, run: Path) -> int:
         """Start or resume a run and kill it; return its exit status, which is 0 if it finished first."""
@@ -46,9 +46,9 @@ class Killer:
     def _start(self, mode: str, config_file: Path, run: Path):
         rng, arguments = self._rng, ("train", str(config_file))
         if mode == "before a file":  # a checkpoint has about 25 file operations
-            child = self._nursery.start(*arguments, folder=run, die_at=int(rng.integers(1, 120)))
+            child = self._fork_server.start(*arguments, folder=run, die_at=int(rng.integers(1, 120)))
             return child, child.wait
-        child = self._nursery.start(*arguments, folder=run)
+        child = self._fork_server.start(*arguments, folder=run)
         if mode == "while writing":
             wait_for_writing(child, run / "checkpoints", times=int(rng.integers(1, 4)))
             return child, lambda: child.kill_after(rng.uniform(0.0, 0.01))  # about the duration of a write
@@ -71,11 +71,15 @@ def wait_for_writing(child: Child, checkpoints: Path, times: int) -> None:
 @pytest.mark.parametrize("keep_best", ["off", "error"] if SOAK_KILLS else ["error"])
 @pytest.mark.parametrize("workers", [0, 2] if SOAK_KILLS else [0])
 def test_run_killed_many_times_equals_an_uninterrupted_run(
-    make_config, reporter, tmp_path, nursery: Nursery, workers: int, keep_best: str
+    make_config, reporter, tmp_path, fork_server: ForkServer, workers: int, keep_best: str
 ) -> None:
     changes = {**CHANGES, "checkpoint__keep_best": keep_best}
     train(make_config(run_dir=str(tmp_path / "whole"), **changes), reporter)
-    killer, runs, num_kills = Killer(nursery, seed=2 * workers + (keep_best == "error")), 0, SOAK_KILLS or len(MODES)
+    killer, runs, num_kills = (
+        Killer(fork_server, seed=2 * workers + (keep_best == "error")),
+        0,
+        SOAK_KILLS or len(MODES),
+    )
     while killer.kills < num_kills:
         runs += 1
         run, config_file = tmp_path / f"killed-{runs}", tmp_path / f"{runs}.yaml"
@@ -84,7 +88,7 @@ def test_run_killed_many_times_equals_an_uninterrupted_run(
         while status == KILLED and killer.kills < num_kills:
             status = killer.kill(config_file, run)
         if status == KILLED:
-            status = nursery.start("train", str(config_file), folder=run).wait()
+            status = fork_server.start("train", str(config_file), folder=run).wait()
         assert status == 0
         assert_same_run(tmp_path / "whole", run)
     assert not wait_for_the_end_of(killer.processes, timeout_s=120), "a worker outlived its run"

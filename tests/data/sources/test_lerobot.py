@@ -99,8 +99,8 @@ def test_states_equal_the_written_states_in_every_version(data_set: Path, episod
     assert not infos.problems
     for number, episode in enumerate(episodes):
         read = source.read(number)
-        written = np.concatenate([episode.columns[name] for name in STATE], axis=1)
-        np.testing.assert_array_equal(read.states, written.astype(np.float64))
+        expected_states = np.concatenate([episode.columns[name] for name in STATE], axis=1)
+        np.testing.assert_array_equal(read.states, expected_states.astype(np.float64))
         assert read.joint_velocities is not None
         np.testing.assert_array_equal(read.joint_velocities, episode.columns["action.joint_velocity"])
         assert read.control_rate_hz == FPS

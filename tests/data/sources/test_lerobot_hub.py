@@ -56,8 +56,8 @@ def test_hub_data_set_equals_the_written_data_set(
     assert not infos.problems
     for number in (3, 0, 4):
         episode = source.read(number, camera=CAMERAS[1])
-        written = np.concatenate([episodes[number].columns[name] for name in STATE], axis=1)
-        np.testing.assert_array_equal(episode.states, written.astype(np.float64))
+        expected_states = np.concatenate([episodes[number].columns[name] for name in STATE], axis=1)
+        np.testing.assert_array_equal(episode.states, expected_states.astype(np.float64))
         frames = episode.read_frames([7, 2, 11])
         assert [numbers_of(frame) for frame in frames] == [(number, step, 1) for step in (7, 2, 11)]
 

@@ -60,9 +60,9 @@ def test_episodes_equal_the_written_episodes(droid: Path) -> None:
         episode = source.read(index)
         assert episode.info == info
         assert np.array_equal(episode.states, synthetic_states(info.num_steps + 1, seed=number)[:-1])
-        written = synthetic_episode(number, steps=info.num_steps, size=(48, 96)).images[CAMERAS[0]]
+        recorded_frames = synthetic_episode(number, steps=info.num_steps, size=(48, 96)).images[CAMERAS[0]]
         frames = episode.read_frames([info.num_steps - 1, 0])
-        for frame, jpeg in zip(frames, (written[-1], written[0]), strict=True):
+        for frame, jpeg in zip(frames, (recorded_frames[-1], recorded_frames[0]), strict=True):
             assert np.array_equal(frame, simplejpeg.decode_jpeg(jpeg, fastdct=True))
         assert episode.metadata["language"] == f"move to place {number}"
         assert episode.control_rate_hz == 15.0

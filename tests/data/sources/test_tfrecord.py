@@ -28,9 +28,9 @@ def test_record_framing_matches_the_specification(tmp_path: Path) -> None:
     masked = (((0x8C28B28A >> 15) | (0x8C28B28A << 17)) + 0xA282EAD8) & 0xFFFFFFFF
     with (tmp_path / "file").open("wb") as stream:
         write_record(stream, b"")
-    written = (tmp_path / "file").read_bytes()
-    assert written[:12] == bytes(8) + masked.to_bytes(4, "little")
-    assert len(written) == 16
+    encoded = (tmp_path / "file").read_bytes()
+    assert encoded[:12] == bytes(8) + masked.to_bytes(4, "little")
+    assert len(encoded) == 16
 
 
 features = st.dictionaries(
@@ -62,11 +62,11 @@ def test_features_are_located_without_reading_other_features(features: dict) -> 
 def test_encoded_example_equals_protobuf_output() -> None:
     """The bytes are those of protobuf 7.36.2 with deterministic=True."""
     features = {"a": ("int64_list", [1, -1, 300]), "a/b": ("float_list", [1.0, -2.5]), "none": ("float_list", [])}
-    written = (
+    encoded = (
         "0a4a0a130a03612f62120c120a0a080000803f000020c00a160a016112111a0f0a0d01ffffffffffffffffff01ac02"
         "0a0a0a046e6f6e65120212000a0f0a047465787412070a050a01780a00"
     )
-    assert encode_example({**features, "text": ("bytes_list", [b"x", b""])}).hex() == written
+    assert encode_example({**features, "text": ("bytes_list", [b"x", b""])}).hex() == encoded
 
 
 def test_bytes_that_are_not_an_example_raise() -> None:
