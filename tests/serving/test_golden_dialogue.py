@@ -15,7 +15,7 @@ MESSAGE_PATHS = sorted(FOLDER.glob("*.bin"))
 
 
 EXAMPLES = runpy.run_path(str(FOLDER / "make.py"))
-make_image = EXAMPLES["picture"]
+make_image = EXAMPLES["draw_image"]
 
 
 def get_replies(messages: list[bytes]) -> list[dict | str]:

@@ -15,7 +15,7 @@ STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 
 
 def draw_image(number: int) -> np.ndarray:
-    """Return a picture that needs no file: 48 x 60 pixels."""
+    """Return an image that needs no file: 48 x 60 pixels."""
     y, x, c = np.mgrid[:48, :60, :3]
     return ((x * (number + 3) + y * (2 * number + 5) + 40 * c) % 256).astype(np.uint8)
 
