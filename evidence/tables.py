@@ -22,16 +22,18 @@ from results import (
     select_policy,
     select_results,
 )
-from scipy.stats import binomtest
+from scipy.stats import binomtest, spearmanr, ttest_rel
 
 from vjepa2_ac.intervals import estimate_mean, estimate_share
 
 FEWEST = 20  # cells of a correlation
+MIN_SEEDS = 3  # smallest number of seeds for a test over seeds
+MIN_CHOICES = 5  # smallest number of choices for the table of choices
 SHORT = ("zero-shot", AXES, BEST, LONGER, "full", "scratch", "scratch, 3x steps")  # rows of the short table
 Correlated = dict[str, tuple[int, dict[str, dict[str, float]]]]  # by change: number of cells, and an interval by name
 SHOWN_TASKS = {"Lift": "Lift", "LIBERO-object": "LIBERO-Spatial, objects changed"}
 """The tasks in which methods differ, and their titles. The page has one sentence about the others."""
-MARKS = {name: f"{name}, made by `make evidence`" for name in ("success", "metrics", "environments")}
+MARKS = {name: f"{name}, made by `make evidence`" for name in ("success", "metrics", "choice", "environments")}
 OFFLINE = {  # numbers in the short table of correlations
     "cost of wrong actions, negative": "growth of the one-step error with shuffled actions",
     "action-ranking error": "**action-ranking error**",
@@ -67,6 +69,7 @@ def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:
     texts = {
         "success": summary(results),
         "metrics": summary_of_correlations(correlated),
+        "choice": choice_table(results),
         "environments": summary_of_tasks(results),
     }
     for part, table in texts.items():
@@ -186,34 +189,62 @@ def _distance(cells: Sequence[Figures]) -> str:
 
 
 def goal_by_goal(results: Sequence[Figures]) -> str:
-    """Return the number of goals that only LoRA reached, that only another method reached, and the p-value.
+    """Return the number of goals that only LoRA reached, that only another method reached, and three p-values.
 
-    All methods have the same goals for one domain shift and seed. Source of the test: McNemar (1947), the exact form.
+    All methods have the same goals for one domain shift and seed. Sources of the tests: McNemar (1947), the exact form;
+    Holm (1979), over all rows; and a paired t-test over seeds, which does not treat goals as independent.
     """
-    rows = []
+    labels, p_values = list[str](), list[float]()
     for shift in (*SHIFTS, *TASKS):
         for base in BASES if shift in SHIFTS else BASES[:1]:
             for other in [name for name in METHODS if name not in {BEST, BEFORE}]:
-                pairs = list(_pairs(results, shift, base, other))
+                by_seed = list(_pairs(results, shift, base, other))
+                pairs = [pair for seed in by_seed for pair in seed]
                 won = sum(ours and not theirs for ours, theirs in pairs)
                 lost = sum(theirs and not ours for ours, theirs in pairs)
                 if won + lost:
-                    chance = binomtest(won, won + lost).pvalue
                     where = f"{CHANGES.get(shift, shift)}{f', {BASE_MODELS[base]}' * (shift in SHIFTS)}"
-                    p = f"{chance:.3f}" if chance >= 0.0005 else "< 0.001"
-                    rows.append(f"| {where} | {describe_method(other)} | {len(pairs)} | {won} | {lost} | {p} |")
+                    seeds = _test_over_seeds(by_seed)
+                    labels.append(f"| {where} | {describe_method(other)} | {len(pairs)} | {won} | {lost} | {seeds}")
+                    p_values.append(float(binomtest(won, won + lost).pvalue))
+    rows = [
+        f"{label} | {_p(value)} | {_p(corrected)} |"
+        for label, value, corrected in zip(labels, p_values, correct_by_holm(p_values), strict=True)
+    ]
     title = f"### {describe_method(BEST)}, compared goal by goal"
-    heads = "domain shift | compared with | goals | reached by LoRA only | reached by the other only | p"
-    head = f"{title}\n\n| {heads} |\n|" + "---|" * 6
+    heads = "domain shift | compared with | goals | reached by LoRA only | reached by the other only"
+    tests = "p over seeds | p over goals | p over goals, corrected"
+    head = f"{title}\n\n| {heads} | {tests} |\n|" + "---|" * 8
     return "\n".join([head, *rows]) if rows else ""
 
 
-def _pairs(results: Sequence[Figures], shift: str, base: str, other: str) -> Iterator[tuple[bool, bool]]:
-    """Yield which goals LoRA and another method reached, with the demonstrations of the main tables."""
+def correct_by_holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values that are corrected for the number of tests. Source: Holm (1979)."""
+    order = np.argsort(p_values)
+    factors = np.arange(len(order), 0, -1)
+    corrected = np.minimum(1.0, np.maximum.accumulate(np.array(p_values)[order] * factors))
+    return [float(value) for value in corrected[np.argsort(order)]]
+
+
+def _test_over_seeds(by_seed: Sequence[Sequence[tuple[bool, bool]]]) -> str:
+    """Return the p-value of a paired t-test over the seeds' numbers of reached goals; empty with fewer than 3 seeds."""
+    ours, theirs = (np.array([sum(pair[side] for pair in pairs) for pairs in by_seed]) for side in (0, 1))
+    differences = ours - theirs
+    if len(differences) < MIN_SEEDS or np.ptp(differences) == 0:
+        return ""
+    return _p(float(ttest_rel(ours, theirs).pvalue))
+
+
+def _p(value: float) -> str:
+    return f"{value:.3f}" if value >= 0.0005 else "< 0.001"
+
+
+def _pairs(results: Sequence[Figures], shift: str, base: str, other: str) -> Iterator[list[tuple[bool, bool]]]:
+    """Yield for each seed which goals LoRA and another method reached, with the demonstrations of the main tables."""
     ours = {result["cell"]["seed"]: result for result in select_main_cells(results, base, BEST, shift)}
     for theirs in select_main_cells(results, base, other, shift):
         if result := ours.get(theirs["cell"]["seed"]):
-            yield from zip(list_reached(result), list_reached(theirs), strict=True)
+            yield list(zip(list_reached(result), list_reached(theirs), strict=True))
 
 
 def correlated_numbers(results: Sequence[Figures]) -> Correlated:
@@ -227,6 +258,40 @@ def correlated_numbers(results: Sequence[Figures]) -> Correlated:
             kinds = [tuple(result["cell"][key] for key in ("shift", "base", "method", "episodes")) for result in group]
             correlated[shift] = len(group), correlations([_offline_row(result) for result in group], missed, kinds)
     return correlated
+
+
+def choice_table(results: Sequence[Figures]) -> str:
+    """Return how well each metric selects one of the models that were trained from one base model for one shift.
+
+    A choice is between the models of one domain shift, base model and seed, with the base model among them. Regret is
+    the success rate of the best of these models minus that of the selected model.
+    """
+    choices: dict[tuple[str, str, int], list[Figures]] = {}
+    for result in results:
+        cell = result["cell"]
+        if "offline" in result and cell["base"] != "none" and cell["episodes"] in {0, 20}:
+            choices.setdefault((cell["shift"], cell["base"], cell["seed"]), []).append(result)
+    models_of_choices = [models for models in choices.values() if len(models) > 2]
+    if len(models_of_choices) < MIN_CHOICES:
+        return ""
+    rates = [[float(np.mean(list_reached(model))) for model in models] for models in models_of_choices]
+    rows = []
+    for name, title in OFFLINE.items():
+        metric = [[_offline_row(model)[name] for model in models] for models in models_of_choices]
+        pairs = list(zip(metric, rates, strict=True))
+        correlation = [-spearmanr(values, rate).statistic for values, rate in pairs if len(set(rate)) > 1]
+        regret = [100 * (max(rate) - rate[int(np.argmin(values))]) for values, rate in pairs]
+        rows.append(f"| {title} | {_mean_cells(correlation, '.2f')} | {_mean_cells(regret, '.1f')} |")
+    average = [100 * (max(rate) - float(np.mean(rate))) for rate in rates]
+    rows.append(f"| none: average of all models |  |  | {_mean_cells(average, '.1f')} |")
+    heads = f"Metric, {len(rates)} choices | rank correlation | 95 % interval | regret in points | 95 % interval"
+    return "\n".join([f"| {heads} |", "|---" * 5 + "|", *rows])
+
+
+def _mean_cells(values: Sequence[float], form: str) -> str:
+    """Return a mean and its interval over choices, as two cells of a table."""
+    mean = estimate_mean(np.array(values), [str(index) for index in range(len(values))])
+    return f"{mean.value:{form}} | {mean.low:{form}} to {mean.high:{form}}"
 
 
 def _offline_row(result: Figures) -> dict[str, float]:

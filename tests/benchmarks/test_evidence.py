@@ -55,6 +55,7 @@ def test_tables_of_the_page_equal_the_stored_results(evidence: Any, stored: Any)
     assert evidence.tables.summary(stored) in page
     assert evidence.tables.summary_of_tasks(stored) in page
     assert evidence.tables.summary_of_correlations(evidence.tables.correlated_numbers(stored)) in page
+    assert evidence.tables.choice_table(stored) in page
     text = (evidence.results.RESULTS / "methods.md").read_text()
     assert "\n\n".join(evidence.tables._rows(stored)) in text
     assert evidence.tables.goal_by_goal(stored) in text
@@ -162,3 +163,30 @@ def test_adapting_planner_trains_on_its_transitions_only_from_the_second_decisio
     assert all(
         bool((frozen[key] == value).all()) for key, value in policy.model.base_predictor.blocks[0].state_dict().items()
     )
+
+
+def test_holm_correction_equals_the_worked_example(evidence: Any) -> None:
+    assert evidence.tables.correct_by_holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert evidence.tables.correct_by_holm([0.7, 0.6]) == [1.0, 1.0]
+
+
+def test_choice_table_has_no_regret_for_a_metric_that_orders_the_models(evidence: Any) -> None:
+    def result(seed: int, metric: float, reached: int) -> dict[str, Any]:
+        cell = {"shift": "look", "base": "one camera", "method": "full", "episodes": 20, "seed": seed}
+        offline = {name: metric for name in evidence.tables.OFFLINE if not name.startswith(("cost", "error"))}
+        shifted = {
+            "rollout_over_persistence": [1.0, 1.0, 2.0 - metric],
+            "one_step": 1.0,
+            "one_step_shuffled_actions": 1.0,
+        }
+        ends = [1.0] * reached + [9.0] * (10 - reached)
+        return {"cell": cell, "offline": offline, "shifted": shifted, "reach": {"l1": {"ends_cm": ends}}}
+
+    results = [result(seed, 0.1 * index, 9 - 3 * index) for seed in range(5) for index in range(3)]
+    rows = {line.split("|")[1].strip(): line for line in evidence.tables.choice_table(results).splitlines()}
+    assert "| 1.00 | 1.00 to 1.00 | 0.0 | 0.0 to 0.0 |" in rows["**action-ranking error**"]
+    assert (
+        "| -1.00 | -1.00 to -1.00 | 60.0 | 60.0 to 60.0 |" in rows["rollout error relative to persistence, 0.8 s ahead"]
+    )
+    assert "| 30.0 | 30.0 to 30.0 |" in rows["none: average of all models"]
+    assert evidence.tables.choice_table(results[:6]) == ""
