@@ -177,7 +177,7 @@ def test_choice_table_has_no_regret_for_a_metric_that_orders_the_models(evidence
         shifted = {
             "rollout_over_persistence": [1.0, 1.0, 2.0 - metric],
             "one_step": 1.0,
-            "one_step_shuffled_actions": 1.0,
+            "one_step_shuffled_actions": 2.0 - metric,
         }
         ends = [1.0] * reached + [9.0] * (10 - reached)
         return {"cell": cell, "offline": offline, "shifted": shifted, "reach": {"l1": {"ends_cm": ends}}}
