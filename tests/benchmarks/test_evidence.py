@@ -9,7 +9,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 
 from paths import ROOT
 from vjepa2_ac.config import ValidationConfig
@@ -18,7 +20,7 @@ from vjepa2_ac.simulation.record import RecordingSpec
 
 MODULES = (
     "environments", "methods", "prepare", "offline", "results", "measure", "tables", "selection",
-    "selection_tables", "labs", "labs_tables",
+    "selection_tables", "labs", "labs_tables", "pretrain_encoder",
 )  # fmt: skip
 
 
@@ -190,3 +192,27 @@ def test_choice_table_has_no_regret_for_a_metric_that_orders_the_models(evidence
     )
     assert "| 30.0 | 30.0 to 30.0 |" in rows["none: average of all models"]
     assert evidence.tables.choice_table(results[:6]) == ""
+
+
+@pytest.mark.parametrize("objective", ["pixels", "latents"])
+def test_pretraining_changes_the_encoder_and_keeps_the_predictor(
+    evidence: Any, objective: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pretrain = evidence.pretrain_encoder
+    monkeypatch.setattr(pretrain, "BATCH", 4)
+    monkeypatch.setattr(pretrain, "HELD_OUT", 4)
+    model = evidence.measure.load_base(evidence.measure.ModelConfig(base=pretrain.BUILTIN, dtype="float32"), seed=0)
+    before = model.fingerprints()
+    frames = torch.randint(0, 256, (12, 3, 96, 96), dtype=torch.uint8)
+    pretrain.pretrain(model, frames, objective, 2)
+    after = model.fingerprints()
+    assert (after.encoder != before.encoder, after.predictor == before.predictor) == (True, True)
+    assert not any(weight.requires_grad for weight in model.loaded_encoder.parameters())
+
+
+def test_mask_covers_the_required_fraction_in_blocks(evidence: Any) -> None:
+    rng = np.random.default_rng(0)
+    masks = np.stack([evidence.pretrain_encoder.draw_mask(rng, 6) for _ in range(50)])
+    assert masks.shape == (50, 36)
+    assert masks.mean(axis=1).min() >= evidence.pretrain_encoder.MASKED
+    assert masks.mean(axis=1).max() < 1
