@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from labs import METHODS, TUNING_LABS, lab_of
+from labs import LABS, METHODS, TUNING_LABS, lab_of
 from results import REACHED_CM, Figures
 from tables import insert_table
 
@@ -58,10 +58,11 @@ def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:
         f"labs {TUNING_LABS + 1} to 12": {key: value for key, value in complete.items() if key > TUNING_LABS},
     }
     advice = "\n\n".join(
-        f"**{title[0].upper()}{title[1:]}**\n\n{advice_table(group)}" for title, group in groups.items()
+        f"**{title[0].upper()}{title[1:]}**\n\n{advice_table(group)}" for title, group in groups.items() if group
     )
-    path.write_text("\n\n".join((all_labs_table(complete), gains_table(complete), advice)) + "\n")
-    if len(complete) == 12:
+    status = f"{len(complete)} of {LABS} labs are measured."
+    path.write_text("\n\n".join((status, all_labs_table(complete), gains_table(complete), advice)) + "\n")
+    if len(complete) == LABS:
         insert_table(docs / "evidence.md", "labs, made by `make evidence`", gains_table(complete))
         insert_table(docs / "evidence.md", "advice, made by `make evidence`", advice_table(groups["labs 7 to 12"]))
 
