@@ -68,7 +68,7 @@ def format_names(row: Row) -> str:
 
 
 def list_settings(options: argparse.Namespace) -> Iterator[Setting]:
-    """Yield all requested settings; the batch size 0 stands for the largest batch."""
+    """Yield all requested settings; the batch size 0 means the largest batch."""
     combinations = itertools.product(options.source, options.frames, options.checkpointing, options.batch)
     for source, frames, checkpointing, batch in combinations:
         yield Setting(frames, 0 if batch == "largest" else int(batch), checkpointing == "on", source == "pixels")

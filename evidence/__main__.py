@@ -110,11 +110,11 @@ def _run_selection(options: argparse.Namespace) -> int:
 
 
 def _run_labs(options: argparse.Namespace) -> int:
-    from labs import all_cells, lab_of, measure, name_of, prepare
+    from labs import all_cells, get_lab, measure, name_of, prepare
     from results import RESULTS
 
     cells = _missing(list(all_cells()), RESULTS / "labs.json", name_of, options)
-    labs = {cell.lab: lab_of(cell.lab) for cell in cells}
+    labs = {cell.lab: get_lab(cell.lab) for cell in cells}
     failed = _in_processes(prepare, [(lab, options.folder) for lab in labs.values()], options)
     return failed + _in_processes(measure, [(cell, options.folder, options.goals) for cell in cells], options)
 

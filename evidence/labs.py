@@ -28,7 +28,6 @@ from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.evaluation.rows import make_rows
 from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.policies.action_prior import train_prior
@@ -72,7 +71,7 @@ class Lab:
         return f"lab {self.number}"
 
 
-def lab_of(number: int) -> Lab:
+def get_lab(number: int) -> Lab:
     """Return a lab; its number determines everything."""
     rng = np.random.default_rng([SEED, number])
     drawn = Lab(number, "new camera", replace(sample_domain(rng, NEW_CAMERAS), name=f"lab-{number}"))
@@ -109,22 +108,22 @@ def all_cells() -> Iterator[Cell]:
 def prepare(lab: Lab, folder: Path) -> None:
     """Record the demonstrations and the held-out episodes of a lab, and encode them."""
     torch.set_num_threads(1)
-    data = _data_of(lab, folder)
+    data = _make_data_config(lab, folder)
     if not Path(data.path).exists():
         spec = RecordingSpec(lab.domain, seed=SEED + lab.number, recipe=lab.recipe)
         record_dataset(data.path, spec, episodes=EPISODES)
     cache_latents(data, BUILTIN)
 
 
-def _data_of(lab: Lab, folder: Path) -> DataConfig:
+def _make_data_config(lab: Lab, folder: Path) -> DataConfig:
     update = {"path": str(folder / f"data-{lab.number}"), "validation_share": 0.2, "test_share": 0.3}
     return data_a(folder).model_copy(update=update)
 
 
 def make_config(cell: Cell, folder: Path) -> Config:
     """Return the config of a cell. Every 100 steps and before the first step the model is validated."""
-    lab = lab_of(cell.lab)
-    data = _data_of(lab, folder)
+    lab = get_lab(cell.lab)
+    data = _make_data_config(lab, folder)
     excluded = exclude_episodes(data, lab.demonstrations, cell.lab)
     rank = int(cell.method.rpartition(" ")[2]) if cell.method.startswith("LoRA") else 0
     rate = 3e-3 if rank else 4e-3
@@ -149,7 +148,7 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     config, closed_loop = make_config(cell, folder), _closed_loop(cell, goals)
     result: dict[str, Any] = {
         "cell": asdict(cell),
-        "condition": lab_of(cell.lab).condition,
+        "condition": get_lab(cell.lab).condition,
         "made_with": describe_software(),
     }
     base = load_base(config.model, seed=config.seed).eval()
@@ -162,8 +161,8 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     elif cell.method == "action prior":
         prior = folder / "lab-runs" / cell.name
         result["held_out"] = dict(train_prior(config, prior).held_out)
-        acts = PLANNING.model_copy(update={"planner": Component("prior"), "prior": str(prior)})
-        result["closed_loop"] = {"newest": closed_loop(Planning(Controller(base, acts)))}
+        planning = PLANNING.model_copy(update={"planner": Component("prior"), "prior": str(prior)})
+        result["closed_loop"] = {"newest": closed_loop(Planning(Controller(base, planning)))}
     else:
         run = train(config, SILENT)
         selected, newest = (select_checkpoint(run, name).path.name for name in (SELECTED, NEWEST))
@@ -173,9 +172,7 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
                 continue
             result["evaluation"][name] = _evaluate(run, name)
             model = load_subject(run, name).world_model
-            if model.adaptation is not None:
-                merge_adapter(model)
-            result["closed_loop"][name] = closed_loop(Planning(Controller(model.eval(), PLANNING)))
+            result["closed_loop"][name] = closed_loop(Planning(Controller(model, PLANNING)))
     return result
 
 
@@ -191,7 +188,7 @@ def compact(result: dict[str, Any]) -> dict[str, Any]:
 
 def _closed_loop(cell: Cell, goals: int) -> Any:
     """Return a function that measures a policy on the goals of a lab: the final distances to the goal (cm)."""
-    spec = BenchmarkOptions("reach", lab_of(cell.lab).domain, goals, GOALS_SEED + GOALS_STEP * cell.lab)
+    spec = BenchmarkOptions("reach", get_lab(cell.lab).domain, goals, GOALS_SEED + GOALS_STEP * cell.lab)
 
     def measure_policy(policy: Policy) -> list[float]:
         return [round(float(distances[-1]), 3) for distances in run_task(spec, policy).distance_cm]
@@ -233,8 +230,9 @@ ROWS = (
 class AdaptingPlanner:
     """A planner that trains its model during the closed loop, without demonstrations.
 
-    Before each decision the model takes one gradient step on the transitions observed so far in the lab, as AdaJEPA
-    (arXiv 2606.32026) does at each replanning. Trained are the input and output projections and the last block.
+    Before each decision the model takes one gradient step on the latest transitions observed in the lab. The idea is
+    from AdaJEPA (arXiv 2606.32026). The choice of trained weights (input and output projections, last block) and the
+    number of transitions are ours.
     """
 
     name = "test-time adaptation"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from labs import LABS, METHODS, TUNING_LABS, lab_of
+from labs import LABS, METHODS, TUNING_LABS, get_lab
 from results import REACHED_CM, Figures
 from tables import insert_table
 
@@ -78,7 +78,7 @@ def all_labs_table(labs: Results) -> str:
     rows = [f"| lab | condition | {' | '.join(METHODS)} |", "|---" * (len(METHODS) + 2) + "|"]
     for number, methods in labs.items():
         rates = [f"{100 * success_rate(methods[method]):.0f} %" for method in METHODS]
-        rows.append(f"| {number} | {lab_of(number).condition} | {' | '.join(rates)} |")
+        rows.append(f"| {number} | {get_lab(number).condition} | {' | '.join(rates)} |")
     return "\n".join(rows)
 
 
@@ -105,8 +105,8 @@ def gains_table(labs: Results) -> str:
 def advice_table(labs: Results) -> str:
     """Return sensitivity, specificity and regret of each advice, over the trained methods of all labs.
 
-    Sensitivity: of the runs whose advised or newest model gains at least 10 points, how many are adapted. Specificity:
-    of the other runs, how many keep the base model. Regret: the success rate lost compared with the better of the base
+    Sensitivity: of the runs whose newest checkpoint gains at least 10 points, how many are adapted. Specificity: of the
+    other runs, how many keep the base model. Regret: the success rate lost compared with the better of the base
     model and the newest checkpoint, on average.
     """
     runs = [(methods[BASE], methods[method]) for methods in labs.values() for method in TRAINED]
@@ -123,7 +123,7 @@ def advice_table(labs: Results) -> str:
         adapted = [checkpoint != BASE for checkpoint in advised]
         hits = sum(is_adapted and gained for is_adapted, gained in zip(adapted, gains, strict=True))
         kept = sum(not is_adapted and not gained for is_adapted, gained in zip(adapted, gains, strict=True))
-        regret = np.mean([max(rate, 0.0) for rate in np.subtract(best, used)])
+        regret = np.mean(np.maximum(np.subtract(best, used), 0.0))  # the selected checkpoint may be better than both
         row = (
             name,
             f"{hits} of {sum(gains)}",

@@ -23,7 +23,6 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import ActionMode, PredictionErrors
 from vjepa2_ac.model.checkpoints import load_base
-from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.policies.action_prior import train_prior
@@ -63,8 +62,6 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     result["shifted"] = _relative_errors(prediction_errors(model, batches))
     if cell.shift in SHIFTS:
         result["offline"] = measure_offline(model, open_dataset(config.data).spaces.action, batches)
-    if model.adaptation is not None:
-        merge_adapter(model)
     result["reach"] = {"l1": closed_loop(cell, Planning(Controller(model, planning)), folder, goals=goals)}
     if cell.method == "zero-shot":
         result["baselines"] = measure_baselines(cell, folder, goals)

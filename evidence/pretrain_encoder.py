@@ -25,13 +25,14 @@ from einops import rearrange
 from jaxtyping import Bool, Float, UInt8
 from prepare import BUILTIN
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, l1_loss, layer_norm, mse_loss
+from torch.nn.functional import interpolate, l1_loss, mse_loss
 
 from vjepa2_ac import read_clips
 from vjepa2_ac.config import ModelConfig, RldsData
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.transforms import pixels_to_input
 from vjepa2_ac.model.checkpoints import load_base
+from vjepa2_ac.model.predictor import normalise_latents
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.simulation.domains import DomainRanges
 from vjepa2_ac.simulation.record import RecordingSpec, record_dataset
@@ -64,16 +65,14 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("folder", type=Path, help="output folder of the model")
     options = parser.parse_args()
-    frames = read_frames(options.frames)
-    model = load_base(ModelConfig(base=BUILTIN, dtype="float32"), seed=0)
-    fresh = WorldModel.random(model.sizes, seed=0, near_persistence=True)
-    pretrain(fresh, frames, options.objective, options.steps)
-    fresh.save_pretrained(options.folder)
+    sizes = load_base(ModelConfig(base=BUILTIN, dtype="float32"), seed=0).sizes
+    model = WorldModel.random(sizes, seed=0, near_persistence=True)
+    pretrain(model, read_frames(options.frames, model.image_size), options.objective, options.steps)
+    model.save_pretrained(options.folder)
 
 
-def read_frames(folder: Path) -> UInt8[Tensor, "frames 3 size size"]:
+def read_frames(folder: Path, size: int) -> UInt8[Tensor, "frames 3 size size"]:
     """Return the frames of all recordings in random order, after recording those that are missing."""
-    size = load_base(ModelConfig(base=BUILTIN, dtype="float32"), seed=0).image_size
     parts = []
     for spec, episodes, num_frames, stride in RECORDINGS:
         path = folder / (spec.task or "reach")
@@ -148,7 +147,7 @@ def pretrain(model: WorldModel, frames: UInt8[Tensor, "frames 3 size size"], obj
         predicted = student(batch, masks)[masks]
         if objective == "latents":
             with torch.no_grad():
-                true = layer_norm(encode(target, batch), (model.latent_dim,))[masks]
+                true = normalise_latents(encode(target, batch))[masks]
             loss = l1_loss(predicted, true)
         else:
             loss = mse_loss(predicted, _patch_pixels(batch, patch)[masks])
@@ -159,7 +158,7 @@ def pretrain(model: WorldModel, frames: UInt8[Tensor, "frames 3 size size"], obj
         _update_average(target, student.vit, 1.0 - (1.0 - AVERAGE) * cosine)
         if step % REPORT_EVERY == 0:
             with torch.no_grad():
-                features = layer_norm(encode(student.vit, _normalised(held_out, model.image_size)), (model.latent_dim,))
+                features = normalise_latents(encode(student.vit, _normalised(held_out, model.image_size)))
             spread = float(features.std(dim=0).mean())  # 0: collapsed, all frames have the same features
             print(
                 f"step {step}: loss {loss:.4f}, std over frames {spread:.3f}, {time.monotonic() - started:.0f} s",

@@ -18,7 +18,6 @@ from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.evaluation.evaluate_run import evaluate_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.evaluation.rows import make_rows
-from vjepa2_ac.model.lora import merge_adapter
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.metrics_log import read_metrics_log
@@ -146,10 +145,8 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     options = EvaluationOptions(clips=48, checkpoint=step, against=(), probes=probes)
     evaluation = evaluate_subject(str(home), options)
     model = load_subject(home, step).world_model
-    if model.adaptation is not None:
-        merge_adapter(model)
     spec = BenchmarkOptions("reach", WORLD, goals, GOALS + cell.run.seed)
-    result = run_task(spec, Planning(Controller(model.eval(), PLANNING)))
+    result = run_task(spec, Planning(Controller(model, PLANNING)))
     measured = {row.key: row.value for row in make_rows(evaluation) if row.model == evaluation.trained}
     return {
         "cell": asdict(cell.run) | {"step": cell.step},

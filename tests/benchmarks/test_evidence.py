@@ -120,10 +120,10 @@ def test_runs_of_the_selection_study_differ_and_the_plots_are_drawn(evidence: An
 
 
 def test_labs_differ_and_a_third_has_a_special_condition(evidence: Any) -> None:
-    labs = [evidence.labs.lab_of(number) for number in range(1, evidence.labs.LABS + 1)]
+    labs = [evidence.labs.get_lab(number) for number in range(1, evidence.labs.LABS + 1)]
     assert len({lab.domain.camera for lab in labs}) == len({cell.name for cell in evidence.labs.all_cells()}) // 6 == 12
     assert [lab.condition == "new camera" for lab in labs].count(False) == 4
-    assert labs[4] == evidence.labs.lab_of(5)
+    assert labs[4] == evidence.labs.get_lab(5)
 
 
 def test_advice_table_counts_helpful_and_harmful_adaptation(evidence: Any) -> None:

@@ -1,5 +1,6 @@
 """Validation: action ranking, selection of the best checkpoint, and early stopping."""
 
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -129,11 +130,15 @@ def test_ignored_actions_are_reported_after_warm_up_and_at_the_end(make_config, 
 
 @pytest.mark.parametrize(
     ("high", "words"),
-    [(0.3, "uses its actions little (action-ranking error 21 % [17, 30], chance 50 %)"), (0.6, "ignores its actions")],
+    [
+        (0.3, "uses its actions little (action-ranking error 21 % [17, 30], chance 50 %)"),
+        (0.6, "ignores its actions"),
+        (math.nan, "ignores its actions"),
+    ],
 )
 def test_weak_effect_of_actions_is_described_by_the_action_ranking(
     high: float, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(validation, "cost_of_actions", lambda *_: Estimate(0.012, 0.0, 0.02))
-    ranking = SimpleNamespace(rank=Estimate(0.21, 0.17, high))
+    ranking = SimpleNamespace(rank=Estimate(0.21, math.nan if math.isnan(high) else 0.17, high))
     assert words in validation.action_warning(SimpleNamespace(errors=None, ranking=ranking))

@@ -1,4 +1,4 @@
-"""Problem manifests: a file with everything that determines a closed-loop measurement, so that others can repeat it."""
+"""Problem manifests: the problems, the search and the seeds of a closed-loop measurement, in a file for repetitions."""
 
 from __future__ import annotations
 

@@ -18,6 +18,7 @@ from vjepa2_ac.evaluation.measure import prediction_errors, previous_clip_action
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Validation, cost_of_actions, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.summary import CHANCE, format_interval, format_percent
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.runs.metrics_log import MetricsLog
@@ -55,9 +56,9 @@ def action_warning(validation: Validation) -> str:
     cost = cost_of_actions(validation.errors, "shuffled").value
     if cost >= MIN_ACTION_EFFECT:
         return ""
-    ranking, consequence = _describe_ranking(validation), "ignores its actions and cannot be used for planning"
-    if ranking and not _is_at_chance(validation):
-        consequence = f"uses its actions little (action-ranking error {ranking})"
+    consequence = "ignores its actions and cannot be used for planning"
+    if (ranking := validation.ranking) is not None and ranking.rank.compare_to(CHANCE) < 0:
+        consequence = f"uses its actions little (action-ranking error {_describe_ranking(ranking.rank)})"
     return (
         f"Warning: shuffled actions change the one-step error by {cost:+.1%} (expected: at least"
         f" +{MIN_ACTION_EFFECT:.0%}). The model {consequence}. Check the data's axes and stride (`vjepa2-ac data"
@@ -66,27 +67,18 @@ def action_warning(validation: Validation) -> str:
 
 
 def base_warning(validation: Validation) -> str:
-    """Return a warning if a base model ranks actions no better than chance, otherwise an empty string."""
-    if not _is_at_chance(validation):
+    """Return a warning if a base model is not shown to rank actions better than chance, otherwise an empty string."""
+    if (ranking := validation.ranking) is None or not ranking.rank.has_interval or ranking.rank.high < CHANCE:
         return ""
     return (
-        f"Warning: the base model ranks actions no better than chance ({_describe_ranking(validation)}). Fine-tuning"
-        " may lower the prediction error without giving a model that can plan. First check data.camera, data.stride and"
-        " the axes (`vjepa2-ac data check CONFIG --model BASE`)"
+        "Warning: the base model is not shown to rank actions better than chance (action-ranking error"
+        f" {_describe_ranking(ranking.rank)}). Fine-tuning may lower the prediction error without giving a model that"
+        " can plan. First check data.camera, data.stride and the axes (`vjepa2-ac data check CONFIG --model BASE`)"
     )
 
 
-def _is_at_chance(validation: Validation) -> bool:
-    """Return whether the interval of the action-ranking error includes chance, or is above it."""
-    ranking = validation.ranking
-    return ranking is not None and ranking.rank.has_interval and ranking.rank.high >= CHANCE
-
-
-def _describe_ranking(validation: Validation) -> str:
-    if validation.ranking is None:
-        return ""
-    rank = validation.ranking.rank
-    return f"{format_percent(rank.value)} % {format_interval(rank)}, chance 50 %".replace("  ", " ")
+def _describe_ranking(error: Estimate) -> str:
+    return f"{format_percent(error.value)} % {format_interval(error)}, chance 50 %"
 
 
 def record(run: Run, validation: Validation, metrics_log: MetricsLog | None) -> bool:

@@ -274,7 +274,7 @@ class NpzFile:
         return InputError(where=f"{self._where}: {name}", found=problem, needed=needed, fix=FORMAT_HELP)
 
     def read_numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
-        """Read an array of finite numbers. In `shape` None stands for any size."""
+        """Read an array of finite numbers. None in `shape` means any size."""
         self._require(name, shape, "biuf", "numbers")
         if (count := prod(self.read_header(name).shape)) > _MAX_NUMBERS:
             raise self.array_error(name, f"{count:,} numbers", f"at most {_MAX_NUMBERS:,} in an episode")
