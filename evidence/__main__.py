@@ -1,13 +1,15 @@
-"""Run the missing measurements of the three studies, and write docs/evidence.md with its plots.
+"""Run the missing measurements of the four studies, and write docs/evidence.md with its plots.
 
     python evidence --table                     # write tables and plots from results/*.json (make evidence)
     python evidence --only look --seeds 1       # run a part of the methods study; finished cells are skipped
     python evidence --study selection           # measure every checkpoint of 21 runs in closed loop
     python evidence --study labs                # adapt to twelve random labs
+    python evidence --study rates               # compare learning rates for the labs study in two other labs
 
 The methods study compares methods that adapt a base model to a changed scene. The selection study compares metrics that
 select a checkpoint. The labs study asks whether adapting helps in a new lab, and whether the advice of the tool is
-good. A finished measurement is a JSON file in the work folder; the values that the tables need are written to
+good. The rates study compares learning rates for the labs study on held-out episodes of other labs, without any goal.
+A finished measurement is a JSON file in the work folder; the values that the tables need are written to
 evidence/results.
 """
 
@@ -41,6 +43,7 @@ def write(folder: Path) -> None:
     """Write the results, tables and plots of all measurements."""
     import labs
     import labs_tables
+    import rates
     import results
     import selection
     import selection_tables
@@ -52,6 +55,7 @@ def write(folder: Path) -> None:
         ("methods", results.compact, results.name_of, tables.write_tables),
         ("selection", selection.compact, selection.name_of, selection_tables.write_tables),
         ("labs", labs.compact, labs.name_of, labs_tables.write_tables),
+        ("rates", labs.compact, rates.name_of, rates.write_tables),
     ):
         measured = results.read_all(folder / study, stored / f"{study}.json", compact, name_of)
         if measured:
@@ -110,16 +114,31 @@ def _run_selection(options: argparse.Namespace) -> int:
 
 
 def _run_labs(options: argparse.Namespace) -> int:
-    from labs import all_cells, get_lab, measure, name_of, prepare
+    from labs import PRETRAINED_PRIOR, all_cells, get_lab, measure, name_of, prepare, prepare_base_prior
     from results import RESULTS
 
     cells = _missing(list(all_cells()), RESULTS / "labs.json", name_of, options)
+    if any(cell.method == PRETRAINED_PRIOR for cell in cells):
+        prepare_base_prior(options.folder, options.workers)
     labs = {cell.lab: get_lab(cell.lab) for cell in cells}
     failed = _in_processes(prepare, [(lab, options.folder) for lab in labs.values()], options)
     return failed + _in_processes(measure, [(cell, options.folder, options.goals) for cell in cells], options)
 
 
-STUDIES = {"methods": _run_methods, "selection": _run_selection, "labs": _run_labs}
+def _run_rates(options: argparse.Namespace) -> int:
+    from labs import PRETRAINED_PRIOR, get_lab, prepare, prepare_base_prior
+    from rates import LAB_NUMBERS, ON_BASE_DATA, all_cells, measure, name_of
+    from results import RESULTS
+
+    cells = _missing(list(all_cells()), RESULTS / "rates.json", name_of, options)
+    if {PRETRAINED_PRIOR, ON_BASE_DATA} & {cell.method for cell in cells}:
+        prepare_base_prior(options.folder, options.workers)
+    labs = [get_lab(number) for number in LAB_NUMBERS if any(cell.lab == number for cell in cells)]
+    failed = _in_processes(prepare, [(lab, options.folder) for lab in labs], options)
+    return failed + _in_processes(measure, [(cell, options.folder) for cell in cells], options)
+
+
+STUDIES = {"methods": _run_methods, "selection": _run_selection, "labs": _run_labs, "rates": _run_rates}
 
 
 def _missing(cells: list[Any], stored: Path, name_of: Callable[[Any], str], options: argparse.Namespace) -> list[Any]:

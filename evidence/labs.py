@@ -30,7 +30,7 @@ from vjepa2_ac.evaluation.summary import summarize
 from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.policies.action_prior import train_prior
+from vjepa2_ac.policies.action_prior import PriorOptions, train_prior
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST, SELECTED, select_checkpoint
 from vjepa2_ac.runs.subject import load_subject
@@ -52,7 +52,24 @@ NO_SHIFT = DomainRanges()  # the ranges of the base model's training data
 DIVERSE = MotionRecipe()
 LOW_DIVERSITY = MotionRecipe(drift_m=(0.01, 0.0, 0.0), turn_rad=0.0, gripper_share=0.0)
 RANKS, STEPS, EVERY = (4, 32), 400, 100
-METHODS = ("base model", "test-time adaptation", "LoRA, rank 4", "LoRA, rank 32", "full fine-tuning", "action prior")
+PRIOR, PRETRAINED_PRIOR = "action prior", "action prior, pre-trained"
+METHODS = (
+    "base model",
+    "test-time adaptation",
+    "LoRA, rank 4",
+    "LoRA, rank 32",
+    "full fine-tuning",
+    PRIOR,
+    PRETRAINED_PRIOR,
+)
+"""Both priors act without a search, so they are goal-conditioned behaviour cloning. The pre-trained prior starts from
+the weights of a prior that was trained on the training data of the base model, as LoRA starts from the base model."""
+
+BASE_EPISODES, BASE_SEED = 800, 3  # the training data of the base model, as configs/demo_base.yaml records them
+BASE_PRIOR = PriorOptions(steps=8_000)
+FINE_TUNING = PriorOptions(steps=500, learning_rate=3e-4)
+"""Training of a prior on the base model's data, and its fine-tuning in a lab. Both are assumed, not yet chosen:
+`python evidence --study rates` compares them with other values on labs that are not part of this study."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +132,36 @@ def prepare(lab: Lab, folder: Path) -> None:
     cache_latents(data, BUILTIN)
 
 
+def prepare_base_prior(folder: Path, workers: int = 1) -> None:
+    """Record and encode the training data of the base model, and train an action prior on them, if missing."""
+    torch.set_num_threads(1)
+    data = _base_data(folder)
+    if not Path(data.path).exists():
+        record_dataset(data.path, RecordingSpec("random", seed=BASE_SEED), episodes=BASE_EPISODES, workers=workers)
+    if not _base_prior(folder).exists():
+        cache_latents(data, BUILTIN)
+        train_prior(make_base_config(folder), _base_prior(folder), BASE_PRIOR)
+
+
+def make_base_config(folder: Path) -> Config:
+    """Return a config of the base model's training data, to train an action prior on them."""
+    model = ModelConfig(base=BUILTIN, dtype="float32")
+    return Config(run_dir="none", data=_base_data(folder), model=model, training=TRAINING)
+
+
+def _base_data(folder: Path) -> DataConfig:
+    return data_a(folder).model_copy(update={"path": str(folder / "data-base")})
+
+
+def _base_prior(folder: Path) -> Path:
+    return folder / "base-prior"
+
+
+def make_prior_options(method: str, folder: Path) -> PriorOptions:
+    """Return the options of the training of a prior in a lab."""
+    return replace(FINE_TUNING, pretrained=_base_prior(folder)) if method == PRETRAINED_PRIOR else PriorOptions()
+
+
 def _make_data_config(lab: Lab, folder: Path) -> DataConfig:
     update = {"path": str(folder / f"data-{lab.number}"), "validation_share": 0.2, "test_share": 0.3}
     return data_a(folder).model_copy(update=update)
@@ -158,9 +205,9 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
         result["closed_loop"]["newest"] = closed_loop(Planning(Controller(base, PLANNING)))
     elif cell.method == "test-time adaptation":
         result["closed_loop"] = {"newest": closed_loop(AdaptingPlanner(base))}
-    elif cell.method == "action prior":
+    elif cell.method in {PRIOR, PRETRAINED_PRIOR}:
         prior = folder / "lab-runs" / cell.name
-        result["held_out"] = dict(train_prior(config, prior).held_out)
+        result["held_out"] = dict(train_prior(config, prior, make_prior_options(cell.method, folder)).held_out)
         planning = PLANNING.model_copy(update={"planner": Component("prior"), "prior": str(prior)})
         result["closed_loop"] = {"newest": closed_loop(Planning(Controller(base, planning)))}
     else:

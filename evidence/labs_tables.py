@@ -50,7 +50,7 @@ def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:
     by_lab: Results = {}
     for result in results:
         by_lab.setdefault(result["cell"]["lab"], {})[result["cell"]["method"]] = result
-    complete = {number: methods for number, methods in sorted(by_lab.items()) if len(methods) == len(METHODS)}
+    complete = {number: methods for number, methods in sorted(by_lab.items()) if methods.keys() >= set(METHODS)}
     if not complete:
         return
     groups = {

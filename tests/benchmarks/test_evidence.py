@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -15,12 +16,12 @@ import torch
 
 from paths import ROOT
 from vjepa2_ac.config import ValidationConfig
-from vjepa2_ac.policies.action_prior import PriorOptions, train_prior
+from vjepa2_ac.policies.action_prior import PriorOptions, load_prior, train_prior
 from vjepa2_ac.simulation.record import RecordingSpec
 
 MODULES = (
     "environments", "methods", "prepare", "offline", "results", "measure", "tables", "selection",
-    "selection_tables", "labs", "labs_tables", "pretrain_encoder",
+    "selection_tables", "labs", "labs_tables", "rates", "pretrain_encoder",
 )  # fmt: skip
 
 
@@ -121,9 +122,56 @@ def test_runs_of_the_selection_study_differ_and_the_plots_are_drawn(evidence: An
 
 def test_labs_differ_and_a_third_has_a_special_condition(evidence: Any) -> None:
     labs = [evidence.labs.get_lab(number) for number in range(1, evidence.labs.LABS + 1)]
-    assert len({lab.domain.camera for lab in labs}) == len({cell.name for cell in evidence.labs.all_cells()}) // 6 == 12
+    assert len({lab.domain.camera for lab in labs}) == 12
+    assert len({cell.name for cell in evidence.labs.all_cells()}) == 12 * len(evidence.labs.METHODS)
     assert [lab.condition == "new camera" for lab in labs].count(False) == 4
     assert labs[4] == evidence.labs.get_lab(5)
+
+
+def test_pretrained_prior_of_a_lab_starts_from_the_prior_of_the_base_data(
+    evidence: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    labs, rates = evidence.labs, evidence.rates
+    lab = replace(labs.get_lab(1), demonstrations=4)
+    for name, value in (
+        ("get_lab", lambda _: lab),
+        ("EPISODES", 11),
+        ("BASE_EPISODES", 4),
+        ("BASE_PRIOR", PriorOptions(steps=1, batch_size=2)),
+        ("FINE_TUNING", PriorOptions(steps=0, batch_size=2)),
+        ("RecordingSpec", partial(RecordingSpec, steps=14)),
+    ):
+        monkeypatch.setattr(labs, name, value)
+    labs.prepare_base_prior(tmp_path)
+    labs.prepare(lab, tmp_path)
+    cell = labs.Cell(1, labs.PRETRAINED_PRIOR)
+    result = labs.measure(cell, tmp_path, 1)
+    assert len(result["closed_loop"]["newest"]) == 1
+    card, prior = load_prior(tmp_path / "lab-runs" / cell.name, where="test")
+    base_card, base_prior = load_prior(tmp_path / "base-prior", where="test")
+    assert (card.data, base_card.data) == (str(tmp_path / "data-1"), str(tmp_path / "data-base"))
+    assert torch.equal(prior.outer.weight, base_prior.outer.weight)
+    compared = rates.measure(rates.Cell(1, labs.PRETRAINED_PRIOR, 1e-3, 0), tmp_path)
+    assert compared["error"] == result["held_out"]["true_goals"]["value"]
+    assert f"| {labs.PRETRAINED_PRIOR} | 0.001 | 0 | 1 | {compared['error']:.3f} | not defined |" in rates.table(
+        [compared]
+    )
+
+
+def test_candidates_of_the_rates_study_differ_and_use_other_labs(evidence: Any) -> None:
+    cells = list(evidence.rates.all_cells())
+    assert len({cell.name for cell in cells}) == len(set(cells)) == len(cells)
+    studied = {cell.lab for cell in evidence.labs.all_cells()}
+    assert not studied & {cell.lab for cell in cells}
+    results = [
+        {
+            "cell": {"lab": lab, "method": "LoRA, rank 4", "rate": 3e-3, "steps": 400},
+            "error": error,
+            "ranking_error": 0.1,
+        }
+        for lab, error in ((101, 0.7), (102, 0.8))
+    ]
+    assert "| LoRA, rank 4 | 0.003 | 400 | 2 | 0.750 | 10.0 % |" in evidence.rates.table(results)
 
 
 def test_advice_table_counts_helpful_and_harmful_adaptation(evidence: Any) -> None:

@@ -122,6 +122,52 @@ def test_prior_training_is_deterministic_and_measures_held_out_errors(make_confi
     assert load_prior(tmp_path / "a", where="test")[0].sizes.ahead == config.data.frames - 1
 
 
+def test_prior_starts_from_the_weights_of_a_pretrained_prior(make_config: MakeConfig, tmp_path: Path) -> None:
+    config = make_config()
+    first = train_prior(config, tmp_path / "first", PriorOptions(steps=3, batch_size=8))
+    ahead = first.sizes.ahead - 1  # a shorter distance to the goal
+    untrained = PriorOptions(steps=0, batch_size=8, ahead=ahead, pretrained=tmp_path / "first")
+    card = train_prior(make_config(seed=5), tmp_path / "second", untrained)
+    assert (card.pretrained, card.sizes.ahead) == (str(tmp_path / "first"), ahead)
+    train_prior(config, tmp_path / "third", PriorOptions(steps=0, batch_size=8, pretrained=tmp_path / "second"))
+    before, shorter, longer = (load_prior(tmp_path / name, where="test")[1] for name in ("first", "second", "third"))
+    rows = [*range(ahead + 1), ahead]  # the last embedding is the start for longer distances
+    for prior, embeddings in ((shorter, rows[:-1]), (longer, rows)):
+        for name, weight in before.state_dict().items():
+            expected = weight[embeddings] if name == "remaining.weight" else weight
+            torch.testing.assert_close(prior.state_dict()[name], expected, rtol=0, atol=0)
+    train_prior(config, tmp_path / "tuned", PriorOptions(steps=3, batch_size=8, pretrained=tmp_path / "first"))
+    tuned = load_prior(tmp_path / "tuned", where="test")[1]
+    assert not torch.equal(tuned.outer.weight, before.outer.weight)
+    torch.testing.assert_close(tuned.scale, before.scale, rtol=0, atol=0)
+
+
+def test_pretrained_prior_with_another_encoder_or_size_raises(
+    make_config: MakeConfig, folder: Path, tmp_path: Path
+) -> None:
+    config, out = make_config(), tmp_path / "out"
+    train_prior(config, tmp_path / "first", PriorOptions(steps=1, batch_size=8))
+    card = json.loads((tmp_path / "first" / CARD).read_text())
+
+    def train_from(pretrained: Path) -> None:
+        train_prior(config, out, PriorOptions(steps=1, batch_size=8, pretrained=pretrained))
+
+    (tmp_path / "first" / CARD).write_text(json.dumps(card | {"encoder": "0" * 64}))
+    with pytest.raises(InputError, match=r"--pretrained: .*first: a prior for encoder 000"):
+        train_from(tmp_path / "first")
+    (tmp_path / "first" / CARD).write_text(json.dumps(card | {"crop": "none"}))
+    with pytest.raises(InputError, match=r"a prior for data\.crop none"):
+        train_from(tmp_path / "first")
+    other = PriorSizes(**{**card["sizes"], "action": card["sizes"]["action"] + 1})
+    about = PriorCard("vjepa2-ac prior 1", other, card["encoder"], card["crop"], "nowhere", 0)
+    save_prior(folder, about, ActionPrior(other))
+    with pytest.raises(InputError, match=r"a prior with the size action 8\. Expected action 7"):
+        train_from(folder)
+    with pytest.raises(InputError, match=r"missing.prior\.json: cannot be read"):
+        train_from(tmp_path / "missing")
+    assert not out.exists()
+
+
 def test_prior_command_writes_into_the_run_and_prints_the_planning_command(
     whole_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -130,6 +176,9 @@ def test_prior_command_writes_into_the_run_and_prints_the_planning_command(
     printed = " ".join(capsys.readouterr().out.split())
     assert "relative to the zero action" in printed
     assert "planning.prior=" in printed
+    further = ["prior", str(whole_run), "--steps", "3", "--out", str(tmp_path / "further"), "--pretrained", str(out)]
+    assert main(further) == 0
+    assert json.loads((tmp_path / "further" / CARD).read_text())["pretrained"] == str(out)
     assert main(["prior", str(tmp_path)]) == 2
 
 

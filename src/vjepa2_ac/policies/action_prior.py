@@ -3,7 +3,7 @@
 Source of the idea: arXiv 2605.08732 (GC-IDM, goal-conditioned inverse dynamics): hindsight goals from demonstrations,
 and adaptive layer norms conditioned on the remaining steps. Positions in an image are computed by a spatial softmax
 (arXiv 1509.06113). A prior is trained on the latents of demonstrations; with cached latents this takes minutes on a
-CPU.
+CPU. Training may start from the weights of another prior.
 """
 
 from __future__ import annotations
@@ -77,6 +77,7 @@ class PriorCard:
     data: str  # data.path
     steps: int
     held_out: Mapping[str, Any] = field(default_factory=dict)
+    pretrained: str = ""  # the folder of the prior from whose weights the training started; empty: random weights
     version: str = __version__
     time: str = ""  # UTC
 
@@ -205,11 +206,15 @@ def load_prior_for_planning(path: str, known: Fingerprints, cameras: Cameras) ->
         InputError: The prior cannot be read, or was trained with another encoder or crop.
     """
     card, prior = load_prior(path, where="planning.prior")
-    for name, trained, model in (("encoder", card.encoder, known.encoder), ("data.crop", card.crop, cameras.crop)):
+    _require_same_inputs(card, known.encoder, cameras.crop, where=f"planning.prior: {path}", fix=_FIX)
+    return prior.to(cameras.model.device).make_start
+
+
+def _require_same_inputs(card: PriorCard, encoder: str, crop: str, *, where: str, fix: str) -> None:
+    for name, trained, model in (("encoder", card.encoder, encoder), ("data.crop", card.crop, crop)):
         if trained != model:
             problem, needed = f"a prior for {name} {trained}; this model has {model}", "a prior trained for this model"
-            raise InputError(where=f"planning.prior: {path}", found=problem, needed=needed, fix=_FIX)
-    return prior.to(cameras.model.device).make_start
+            raise InputError(where=where, found=problem, needed=needed, fix=fix)
 
 
 _NUM_SCALE_BATCHES = 8  # number of batches from which the scale of the actions is computed
@@ -224,6 +229,7 @@ class PriorOptions:
     ahead: int | None = None  # largest number of model steps from a frame to its goal; None: that of the run's clips
     batch_size: int = 32
     learning_rate: float = 1e-3
+    pretrained: Path | None = None  # the folder of a prior; training starts from its weights. None: random weights
 
 
 @dataclass(frozen=True)
@@ -253,7 +259,7 @@ def train_prior(
         action's, for true goals and for goals of other clips. If both errors are equal, the prior ignores the goal.
 
     Raises:
-        InputError: The data or the model cannot be used, or the loss is not finite.
+        InputError: The data, the model or the pre-trained prior cannot be used, or the loss is not finite.
     """
     options = options or PriorOptions()
     require_stride(config.data, to="train a prior")
@@ -277,6 +283,7 @@ def train_prior(
         data=data.path,
         steps=options.steps,
         held_out=_measure(dataset, model, prior, spaces),
+        pretrained=str(options.pretrained or ""),
         time=utc_now(),
     )
     save_prior(folder, card, prior)
@@ -287,19 +294,20 @@ def _train(
     dataset: Dataset, model: WorldModel, config: Config, options: PriorOptions, reporter: Reporter
 ) -> ActionPrior:
     generator, spaces = torch.Generator().manual_seed(config.seed), dataset.spaces
+    grid, widths, ahead = model.image_size // model.sizes.patch_size, spaces.widths, dataset.config.frames - 1
+    sizes = PriorSizes(grid, model.latent_dim, widths.state, widths.action, ahead)
+    prior = None
+    if options.pretrained is not None:
+        prior = _load_pretrained(options.pretrained, sizes, model.encoder_fingerprint(), config.data.crop)
     progress, steps = reporter.task("training the prior", "steps"), options.steps
     with closing(training_loader(dataset, seed=config.seed, batch_size=options.batch_size)) as batches:
         first_batches = [
             _draw_pairs(clips, spaces, generator)
             for clips in itertools.islice(_encode_batches(batches, model), _NUM_SCALE_BATCHES)
         ]
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            grid, widths = model.image_size // model.sizes.patch_size, dataset.spaces.widths
-            ahead = dataset.config.frames - 1
-            sizes = PriorSizes(grid, model.latent_dim, widths.state, widths.action, ahead)
-            prior = ActionPrior(sizes).to(model.device)
-        prior.scale.copy_(torch.cat([batch.changes for batch in first_batches]).std(dim=0).clamp(min=1e-6))
+        if prior is None:
+            prior = _make_prior(sizes, torch.cat([batch.changes for batch in first_batches]), config.seed)
+        prior.to(model.device)
         optimizer = torch.optim.AdamW(prior.parameters(), lr=options.learning_rate, weight_decay=0.01)
         pairs = (_draw_pairs(clips, spaces, generator) for clips in _encode_batches(batches, model))
         for step, batch in enumerate(itertools.islice(itertools.chain(first_batches, pairs), steps), start=1):
@@ -319,6 +327,38 @@ def _train(
             optimizer.step()
             progress(step, steps)
     return prior.eval().requires_grad_(False)
+
+
+def _make_prior(sizes: PriorSizes, changes: Float[Tensor, "steps action_dim"], seed: int) -> ActionPrior:
+    """Return a prior with random weights for actions of the scale of these changes."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        prior = ActionPrior(sizes)
+    prior.scale.copy_(changes.std(dim=0).clamp(min=1e-6))
+    return prior
+
+
+def _load_pretrained(folder: Path, sizes: PriorSizes, encoder: str, crop: str) -> ActionPrior:
+    """Load a prior for further training. The scale of its actions stays, because its weights predict in this unit.
+
+    The longest distance to a goal may differ. The pre-trained prior uses its last embedding for longer distances, so
+    this embedding is the start for them.
+
+    Raises:
+        InputError: The prior cannot be read, or was trained for another encoder, crop or width of states or actions.
+    """
+    card, pretrained = load_prior(folder, where="--pretrained")
+    where, fix = f"--pretrained: {folder}", "Train a prior on a config with this encoder and data, or omit --pretrained"
+    _require_same_inputs(card, encoder, crop, where=where, fix=fix)
+    for name, size in asdict(card.sizes).items():
+        if name != "ahead" and size != getattr(sizes, name):
+            problem, needed = f"a prior with the size {name} {size}", f"{name} {getattr(sizes, name)}"
+            raise InputError(where=where, found=problem, needed=needed, fix=fix)
+    weights = pretrained.state_dict()
+    rows = torch.arange(sizes.ahead + 1).clamp(max=card.sizes.ahead)
+    prior = ActionPrior(sizes)
+    prior.load_state_dict(weights | {"remaining.weight": weights["remaining.weight"][rows]})
+    return prior
 
 
 def prior_loss(mean: Tensor, deviation: Tensor, changes: Tensor) -> Tensor:
