@@ -1,4 +1,7 @@
-"""Write the tables of the selection study: which checkpoint each rule selects, and which metric predicts success."""
+"""Write the tables of the selection study: which checkpoint each rule selects, and which metric predicts success.
+
+The short table, about choices between the checkpoints of one run, is also written into docs/evaluation.md.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,21 @@ from pathlib import Path
 import numpy as np
 from offline import correlations
 from results import Figures
+from scipy.stats import spearmanr
 from selection import cells_of, run_of
+from tables import insert_table
 
-from vjepa2_ac.intervals import estimate_share
+from vjepa2_ac.intervals import estimate_mean, estimate_share
 from vjepa2_ac.runs.checkpoint import RunState
 
+MARK = "selection, made by `make evidence`"
+KINDS = {"narrow": "low-diversity data", "varied": "diverse data"}
 TITLES = {
     "one_step": "one-step error relative to persistence",
     "error": "rollout error relative to persistence, last horizon",
-    "shuffled": "growth of the error with shuffled actions, negated",
-    "ranking": "action-ranking error (selects checkpoints)",
-    "spread": "standard deviation of the energy, negated",
+    "shuffled": "growth of the error with shuffled actions",
+    "ranking": "**action-ranking error**",
+    "spread": "standard deviation of the energy over alternative actions",
 }
 
 
@@ -43,9 +50,11 @@ RULES: dict[str, Callable[[list[Figures]], Figures]] = {
 
 
 def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:
-    """Write the table and the plot, of runs of which every checkpoint is measured."""
+    """Write the tables and the plot, of runs of which every checkpoint is measured."""
     runs = [run for run in by_run(results) if len(run) == len(cells_of(run_of(run[0])))]
-    path.write_text("\n".join([*_rules(runs), "", *_correlations(runs)]) + "\n")
+    parts = ("\n".join(_rules(runs)), "\n".join(_correlations(runs)), within_runs(runs), within_runs(runs, first=1))
+    path.write_text("\n\n".join(parts) + "\n")
+    insert_table(docs / "evaluation.md", MARK, within_runs(runs))
     draw(runs, docs / "ranking.png")
 
 
@@ -104,7 +113,7 @@ def _correlations(runs: Sequence[list[Figures]]) -> Iterator[str]:
         )
         for subset in subsets.values()
     ]
-    yield f"| metric, over {len(results)} checkpoints | {' | '.join(subsets)} |"
+    yield f"| metric (lower is better after a change of sign), over {len(results)} checkpoints | {' | '.join(subsets)} |"
     yield "|---" * (len(subsets) + 1) + "|"
     for name, title in TITLES.items():
         cells = [
@@ -112,6 +121,48 @@ def _correlations(runs: Sequence[list[Figures]]) -> Iterator[str]:
             for estimates in columns
         ]
         yield f"| {title} | {' | '.join(cells)} |"
+
+
+def within_runs(runs: Sequence[list[Figures]], first: int = 0) -> str:
+    """Return how well each metric selects one checkpoint of a run, averaged over the runs without replay.
+
+    The rank correlation is Spearman's, between the metric and the final distance from the goal, over the checkpoints of
+    one run from number `first` on; checkpoint 0 is the base model. Regret is the distance of the selected checkpoint
+    minus the smallest distance of the run.
+    """
+    groups = [
+        [run[first:] for run in runs if run[0]["cell"]["motions"] == kind and not run[0]["cell"]["cure"]]
+        for kind in KINDS
+    ]
+    heads = " | ".join(f"{kind}: rank correlation | 95 % interval | regret, cm" for kind in KINDS.values())
+    selectable = "checkpoints and base model" if first == 0 else "checkpoints without the base model"
+    rows = [f"| Metric, {selectable} | {heads} |", "|---" * (3 * len(KINDS) + 1) + "|"]
+    for name, title in TITLES.items():
+        cells = [_correlation_and_regret(group, name) for group in groups]
+        rows.append(f"| {title} | {' | '.join(cells)} |")
+    for title, distance in (
+        ("none: average of all checkpoints", lambda run: np.mean([checkpoint["left_cm"] for checkpoint in run])),
+        (f"none: always the {'base model' if first == 0 else 'first checkpoint'}", lambda run: run[0]["left_cm"]),
+        ("none: always the last checkpoint", lambda run: run[-1]["left_cm"]),
+    ):
+        regrets = [np.mean([distance(run) - _shortest_distance(run) for run in group]) for group in groups]
+        rows.append(f"| {title} | {' | '.join(f' |  | {regret:.1f}' for regret in regrets)} |")
+    return "\n".join(rows)
+
+
+def _correlation_and_regret(runs: Sequence[list[Figures]], name: str) -> str:
+    """Return the mean rank correlation of a metric, its interval over runs, and the mean regret, as three cells."""
+    metric = [[checkpoint["offline"][name] for checkpoint in run] for run in runs]
+    distances = [[checkpoint["left_cm"] for checkpoint in run] for run in runs]
+    pairs = list(zip(metric, distances, strict=True))
+    correlations_of_runs = np.array([spearmanr(values, distance).statistic for values, distance in pairs])
+    mean = estimate_mean(correlations_of_runs, [str(index) for index in range(len(runs))])
+    regret = np.mean([distance[int(np.argmin(values))] - min(distance) for values, distance in pairs])
+    return f"{mean.value:.2f} | {mean.low:.2f} to {mean.high:.2f} | {regret:.1f}"
+
+
+def _shortest_distance(run: Sequence[Figures]) -> float:
+    return float(min(checkpoint["left_cm"] for checkpoint in run))
 
 
 def draw(runs: Sequence[list[Figures]], path: Path) -> None:

@@ -65,7 +65,39 @@ def test_tables_of_the_page_equal_the_stored_results(evidence: Any, stored: Any)
     selection = json.loads((evidence.results.RESULTS / "selection.json").read_text())
     rules = "\n".join(evidence.selection_tables._rules(evidence.selection_tables.by_run(selection)))
     assert rules in (evidence.results.RESULTS / "selection.md").read_text()
+    within_runs = evidence.selection_tables.within_runs(evidence.selection_tables.by_run(selection))
+    assert within_runs in (ROOT / "docs/evaluation.md").read_text()
     assert sum(path.stat().st_size for path in evidence.results.RESULTS.glob("*.json")) < 300_000
+
+
+def test_numbers_in_the_text_of_the_evaluation_page_equal_the_stored_results(evidence: Any, stored: Any) -> None:
+    page = " ".join((ROOT / "docs/evaluation.md").read_text().split())
+    table = evidence.tables.choice_table([result for result in stored if result["cell"]["episodes"]])
+    rows = {line.split("|")[1].strip(): line.split("|") for line in table.splitlines()}
+    assert "Metric, 8 choices" in rows
+    correlation, interval = (cell.strip() for cell in rows["**action-ranking error**"][2:4])
+    assert f"rank correlation with the success rate is {correlation} (95 % interval {interval})" in page
+
+    def condition(result: dict[str, Any]) -> tuple[Any, ...]:
+        return tuple(result["cell"][key] for key in ("shift", "base", "seed"))
+
+    measured = [result for result in stored if "offline" in result]
+    base_models = {condition(result): result for result in measured if result["cell"]["method"] == "zero-shot"}
+    pairs = [
+        (base_models[condition(result)], result)
+        for result in measured
+        if condition(result) in base_models and result["cell"]["episodes"]
+    ]
+    assert all(
+        trained["offline"]["action-ranking error"] < base["offline"]["action-ranking error"] for base, trained in pairs
+    )
+    gains = [
+        np.mean(evidence.results.list_reached(trained)) - np.mean(evidence.results.list_reached(base))
+        for base, trained in pairs
+    ]
+    rose, equal, fell = (sum(np.sign(gains) == sign) for sign in (1, 0, -1))
+    assert f"all {len(pairs)} fine-tuned models is lower" in page
+    assert f"The success rate rose for {rose} of them, did not change for {equal}, and fell for {fell}." in page
 
 
 @pytest.fixture(scope="module")
@@ -240,6 +272,30 @@ def test_choice_table_has_no_regret_for_a_metric_that_orders_the_models(evidence
     )
     assert "| 30.0 | 30.0 to 30.0 |" in rows["none: average of all models"]
     assert evidence.tables.choice_table(results[:6]) == ""
+
+
+def test_table_within_runs_has_no_regret_for_a_metric_that_orders_the_checkpoints(evidence: Any) -> None:
+    def checkpoint(motions: str, seed: int, step: int) -> dict[str, Any]:
+        distance = {0: 9.0, 100: 3.0, 200: 1.0}[step]
+        names = evidence.selection_tables.TITLES
+        offline = {name: distance if name == "ranking" else -distance for name in names}
+        cell = {"motions": motions, "method": "LoRA", "seed": seed, "cure": "", "step": step}
+        return {"cell": cell, "offline": offline, "left_cm": distance}
+
+    runs = [
+        [checkpoint(kind, seed, step) for step in (0, 100, 200)]
+        for kind in evidence.selection_tables.KINDS
+        for seed in range(5)
+    ]
+    ignored = [result | {"cell": result["cell"] | {"cure": "replay"}, "left_cm": 0.0} for result in runs[0]]
+    table = evidence.selection_tables.within_runs([*runs, ignored])
+    rows = {line.split("|")[1].strip(): line for line in table.splitlines()}
+    assert "| 1.00 | 1.00 to 1.00 | 0.0 | 1.00 | 1.00 to 1.00 | 0.0 |" in rows["**action-ranking error**"]
+    assert "| -1.00 | -1.00 to -1.00 | 8.0 | -1.00 |" in rows["one-step error relative to persistence"]
+    assert "| 8.0 |" in rows["none: always the base model"]
+    assert "| 0.0 |" in rows["none: always the last checkpoint"]
+    without_base = evidence.selection_tables.within_runs(runs, first=1)
+    assert "| none: always the first checkpoint |  |  | 2.0 |  |  | 2.0 |" in without_base
 
 
 @pytest.mark.parametrize("objective", ["pixels", "latents"])
