@@ -113,7 +113,7 @@ def _correlations(runs: Sequence[list[Figures]]) -> Iterator[str]:
         )
         for subset in subsets.values()
     ]
-    yield f"| metric (lower is better after a change of sign), over {len(results)} checkpoints | {' | '.join(subsets)} |"
+    yield f"| metric (sign: lower is better), over {len(results)} checkpoints | {' | '.join(subsets)} |"
     yield "|---" * (len(subsets) + 1) + "|"
     for name, title in TITLES.items():
         cells = [
