@@ -1,16 +1,17 @@
-"""Run the missing measurements of the four studies, and write docs/evidence.md with its plots.
+"""Run the missing measurements of the five studies, and write docs/evidence.md with its plots.
 
     python evidence --table                     # write tables and plots from results/*.json (make evidence)
     python evidence --only look --seeds 1       # run a part of the methods study; finished cells are skipped
     python evidence --study selection           # measure every checkpoint of 21 runs in closed loop
     python evidence --study labs                # adapt to twelve random labs
     python evidence --study rates               # compare learning rates for the labs study in two other labs
+    python evidence --study iterations          # compare searches of different sizes
 
 The methods study compares methods that adapt a base model to a changed scene. The selection study compares metrics that
 select a checkpoint. The labs study asks whether adapting helps in a new lab, and whether the advice of the tool is
 good. The rates study compares learning rates for the labs study on held-out episodes of other labs, without any goal.
-A finished measurement is a JSON file in the work folder; the values that the tables need are written to
-evidence/results.
+The iterations study asks how many action sequences and iterations a decision needs. A finished measurement is a JSON
+file in the work folder; the values that the tables need are written to evidence/results.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+GOALS = {"iterations": 50}  # number of goals of each cell by study; 20 for the other studies
 
 
 def main() -> int:
@@ -41,6 +43,8 @@ def main() -> int:
 
 def write(folder: Path) -> None:
     """Write the results, tables and plots of all measurements."""
+    import iterations
+    import iterations_tables
     import labs
     import labs_tables
     import rates
@@ -56,6 +60,7 @@ def write(folder: Path) -> None:
         ("selection", selection.compact, selection.name_of, selection_tables.write_tables),
         ("labs", labs.compact, labs.name_of, labs_tables.write_tables),
         ("rates", labs.compact, rates.name_of, rates.write_tables),
+        ("iterations", iterations.compact, iterations.name_of, iterations_tables.write_tables),
     ):
         measured = results.read_all(folder / study, stored / f"{study}.json", compact, name_of)
         if measured:
@@ -75,14 +80,16 @@ def _parse() -> argparse.Namespace:
         "--seeds", type=int, default=5, help="largest number of seeds; docs/evidence.md has the number for each change"
     )
     parser.add_argument(
-        "--goals", type=int, default=20, help="number of goals of each cell; a table row pools its seeds"
+        "--goals", type=int, help="number of goals of each cell (20; 50 for iterations); a table row pools its seeds"
     )
     parser.add_argument(
         "--workers", type=int, default=2, help="number of cells that run in parallel, with one thread each"
     )
     parser.add_argument("--only", default="", help="run only cells whose name contains this text")
     parser.add_argument("--table", action="store_true", help="write tables and plots without running measurements")
-    return parser.parse_args()
+    options = parser.parse_args()
+    options.goals = options.goals or GOALS.get(options.study, 20)
+    return options
 
 
 def _run_methods(options: argparse.Namespace) -> int:
@@ -138,7 +145,23 @@ def _run_rates(options: argparse.Namespace) -> int:
     return failed + _in_processes(measure, [(cell, options.folder) for cell in cells], options)
 
 
-STUDIES = {"methods": _run_methods, "selection": _run_selection, "labs": _run_labs, "rates": _run_rates}
+def _run_iterations(options: argparse.Namespace) -> int:
+    from iterations import TASKS, all_cells, measure, name_of, prepare
+    from results import RESULTS
+
+    cells = _missing(list(all_cells()), RESULTS / "iterations.json", name_of, options)
+    tasks = [TASKS[name] for name in dict.fromkeys(cell.task for cell in cells)]
+    failed = _in_processes(prepare, [(task, options.folder) for task in tasks], options)
+    return failed + _in_processes(measure, [(cell, options.folder, options.goals) for cell in cells], options)
+
+
+STUDIES = {
+    "methods": _run_methods,
+    "selection": _run_selection,
+    "labs": _run_labs,
+    "rates": _run_rates,
+    "iterations": _run_iterations,
+}
 
 
 def _missing(cells: list[Any], stored: Path, name_of: Callable[[Any], str], options: argparse.Namespace) -> list[Any]:

@@ -21,7 +21,7 @@ from vjepa2_ac.simulation.record import RecordingSpec
 
 MODULES = (
     "environments", "methods", "prepare", "offline", "results", "measure", "tables", "selection",
-    "selection_tables", "labs", "labs_tables", "rates", "pretrain_encoder",
+    "selection_tables", "labs", "labs_tables", "rates", "iterations", "iterations_tables", "pretrain_encoder",
 )  # fmt: skip
 
 
@@ -51,6 +51,9 @@ def test_condition_names_are_unique_and_each_stored_result_has_a_condition(evide
     checkpoints = list(evidence.selection.all_cells(seeds=3))
     selection = json.loads((evidence.results.RESULTS / "selection.json").read_text())
     assert {cell.name for cell in checkpoints} <= {evidence.selection.name_of(result) for result in selection}
+    searches = list(evidence.iterations.all_cells())
+    assert len({cell.name for cell in searches}) == len(searches)
+    assert all(evidence.iterations.name_of({"cell": vars(cell)}) == cell.name for cell in searches)
 
 
 def test_tables_of_the_page_equal_the_stored_results(evidence: Any, stored: Any) -> None:
@@ -67,7 +70,7 @@ def test_tables_of_the_page_equal_the_stored_results(evidence: Any, stored: Any)
     assert rules in (evidence.results.RESULTS / "selection.md").read_text()
     within_runs = evidence.selection_tables.within_runs(evidence.selection_tables.by_run(selection))
     assert within_runs in (ROOT / "docs/evaluation.md").read_text()
-    assert sum(path.stat().st_size for path in evidence.results.RESULTS.glob("*.json")) < 300_000
+    assert sum(path.stat().st_size for path in evidence.results.RESULTS.glob("*.json")) < 450_000
 
 
 def test_numbers_in_the_text_of_the_evaluation_page_equal_the_stored_results(evidence: Any, stored: Any) -> None:
@@ -245,6 +248,93 @@ def test_adapting_planner_trains_on_its_transitions_only_from_the_second_decisio
     assert all(
         bool((frozen[key] == value).all()) for key, value in policy.model.base_predictor.blocks[0].state_dict().items()
     )
+
+
+def test_decisions_of_one_long_search_equal_those_of_shorter_searches(evidence: Any) -> None:
+    study = evidence.iterations
+    model = evidence.labs.load_base(evidence.labs.ModelConfig(base=evidence.labs.BUILTIN, dtype="float32"), seed=0)
+    planning = study.load_config("builtin:demo").planning.model_copy(update={"samples": 12})
+    controllers = [
+        study.Controller(model.eval(), planning.model_copy(update={"iterations": iterations}), seed=3)
+        for iterations in (10, 1, 3)
+    ]
+    task = study.TASKS["reach-demo"]
+    result = study.measure_decisions(task, controllers[0], 2)
+    arm = study.arm_for("reach", task.domain)
+    starts = list(study.demonstrate_problems(task, arm, controllers[0], 2))
+    for controller, count in zip(controllers[1:], ("1", "3"), strict=True):
+        for number, (trial, episode) in enumerate(starts):
+            decision = study.decide_at(controller, trial, episode, number % episode.steps_needed)
+            expected = [*(100 * decision.action[:3]), decision.plan.energy]
+            assert result["searches"][count][number][:4] == pytest.approx(expected, abs=1e-4)
+    first, second = (episode for _, episode in starts)
+    assert result["oracle"][0] == pytest.approx(100 * first.actions[0, :3])
+    assert result["oracle"][1] == pytest.approx(100 * second.actions[1, :3])
+    assert study.compact(result | {"cell": {}})["searches"]["3"][0][0] == round(result["searches"]["3"][0][0], 2)
+
+
+def test_sub_goals_are_those_after_the_start_of_the_decision(evidence: Any) -> None:
+    study = evidence.iterations
+    image = np.zeros((2, 2, 3), np.uint8)
+    calls: list[Any] = []
+    controller = SimpleNamespace(follow=calls.append, reset=calls.append, act=lambda *_: None, decision="made")
+    episode = SimpleNamespace(frames=np.zeros((4, 2, 2, 3)), states=np.zeros((4, 7)), goal_image=image)
+    trial = study.Trial(0, 3, 4, goals=("after step 1", "after step 2", "after step 3"))
+    assert study.decide_at(controller, trial, episode, 1) == "made"
+    study.decide_at(controller, study.Trial(0, 3, 4), episode, 1)
+    assert calls == [("after step 2", "after step 3"), image]
+
+
+def test_decisions_table_compares_each_search_with_the_reference(evidence: Any) -> None:
+    def result(samples: int, dx_cm: float, energy: float) -> dict[str, Any]:
+        cell = {"kind": "decisions", "task": "push", "samples": samples, "iterations": 10}
+        searches = {str(count): [[dx_cm, 0.0, 0.0, energy, 0.5]] * 4 for count in evidence.iterations.ITERATIONS}
+        return {"cell": cell, "oracle": [[5.0, 0.0, 3.0]] * 4, "zero_action_energy": [0.6] * 4, "searches": searches}
+
+    results = [result(800, 5.0, 0.4), result(64, 3.0, 0.45)]
+    table = evidence.iterations_tables.decisions_table(results, ["push"])
+    assert "| 64 | 3 | 192 | 2.00 | 2.00 to 2.00 | 75.0 % | 75.0 to 75.0 % | 3.61 | 3.61 to 3.61 | 0.50 |" in table
+    assert "| 800 | 10 | 8,000 | reference |  | 100 % |  | 3.00 | 3.00 to 3.00 | 0.50 |" in table
+    assert len(table.splitlines()) == 2 + 2 * len(evidence.iterations.ITERATIONS)
+
+
+def test_closed_loop_table_compares_the_same_problems_of_all_tasks(evidence: Any) -> None:
+    def result(task: str, samples: int, iterations: int, solved: list[int]) -> dict[str, Any]:
+        cell = {"kind": "closed loop", "task": task, "samples": samples, "iterations": iterations}
+        return {"cell": cell, "solved": solved, "distance_cm": [1.0] * len(solved)}
+
+    tasks = list(evidence.iterations.TASKS)
+    results = [result(task, 64, 1, [0, 0, 0, 1]) for task in tasks] + [
+        result(task, 64, 3, [1, 1, 0, 1]) for task in tasks
+    ]
+    incomplete = [result(tasks[0], 800, 3, [1, 1, 1, 1])]
+    table = evidence.iterations_tables.closed_loop_table(results + incomplete)
+    rates = "| 25 % | 25 % | 25 % | 25 % | 25 % | 10 to 49 % |"
+    assert f"| 64 | 1 | 64 {rates} -50.0 points | -75.0 to -25.0 points | 0.008 |" in table
+    assert "| 64 | 3 | 192 |" in table.splitlines()[-1]
+    assert table.splitlines()[-1].endswith("| reference |  |  |")
+    assert "800" not in table
+    assert evidence.iterations_tables.closed_loop_table(incomplete) == ""
+
+
+def test_tables_enter_the_page_when_every_search_but_the_largest_is_measured(evidence: Any, tmp_path: Path) -> None:
+    study, tables = evidence.iterations, evidence.iterations_tables
+    marks = [f"<!-- {mark}: begin -->\n<!-- {mark}: end -->" for mark in tables.MARKS]
+    page = tmp_path / "planning.md"
+    page.write_text("\n".join(marks))
+    results = []
+    for cell in study.all_cells():
+        result: dict[str, Any] = {"cell": vars(cell)}
+        if cell.kind == "decisions":
+            rows = {str(count): [[1.0, 0.0, 0.0, 0.4, 0.5]] * 2 for count in study.ITERATIONS}
+            result |= {"oracle": [[5.0, 0.0, 3.0]] * 2, "zero_action_energy": [0.6] * 2, "searches": rows}
+        results.append(result if cell.kind == "decisions" else result | {"solved": [1, 0]})
+    largest = len(study.TASKS)
+    tables.write_tables(results[: -largest - 1], tmp_path / "iterations.md", tmp_path)
+    assert page.read_text() == "\n".join(marks)
+    tables.write_tables(results[:-largest], tmp_path / "iterations.md", tmp_path)
+    assert page.read_text().count("| 64 | 10 | 640 |") == 2
+    assert (tmp_path / "iterations.md").read_text().count("| 64 | 10 | 640 |") == 2 + len(study.TASKS)
 
 
 def test_holm_correction_equals_the_worked_example(evidence: Any) -> None:
