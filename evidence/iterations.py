@@ -27,12 +27,13 @@ from results import rounded
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.goals.key_frames import MODEL_STEP_RULE, add_frames_between, find_gripper_key_frames
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.simulation.arm import SimulatedArm
-from vjepa2_ac.simulation.benchmark import BenchmarkOptions, Planning, SubGoals, demonstrate, demonstrated_goals
+from vjepa2_ac.simulation.benchmark import BenchmarkOptions, Planning, demonstrate, goals_of_episode
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.record import RecordedTask, RecordingSpec, record_dataset
 from vjepa2_ac.simulation.rollout import ArmEnvironment, EpisodeResult, Trial, run_trials
@@ -58,7 +59,7 @@ class Task:
     demonstrations: int
     training_steps: int
     steps: int | None = None  # model steps of a problem; None: the default of the task
-    sub_goals: SubGoals = "none"
+    has_sub_goals: bool = False  # whether each step of the oracle's solution is a sub-goal
 
     @property
     def options(self) -> BenchmarkOptions:
@@ -74,7 +75,7 @@ TASKS = {
         Task("reach-demo", "reach, domain of the demo", "demo", DOMAIN_B, None, 40, 800),
         Task("reach-mounting", "reach, mounting rotated", "demo", _MOUNTING, None, 40, 800),
         Task("push", "push", "push", DOMAIN_A, "push", 100, 1_500),
-        Task("pick", "pick, sub-goals", "pick", DOMAIN_A, "pick", 100, 2_000, steps=18, sub_goals="every-step"),
+        Task("pick", "pick, sub-goals", "pick", DOMAIN_A, "pick", 100, 2_000, steps=18, has_sub_goals=True),
     )
 }
 
@@ -175,7 +176,8 @@ def demonstrate_problems(
         except InputError:  # the oracle does not solve this problem
             continue
         solved += 1
-        goals = () if task.sub_goals == "none" else demonstrated_goals(trial, arm, limits, task.sub_goals)
+        keys = add_frames_between(find_gripper_key_frames(episode.states, MODEL_STEP_RULE), 1)
+        goals = goals_of_episode(episode, keys, "every-step") if task.has_sub_goals else ()
         yield replace(trial, goals=goals), episode
 
 
