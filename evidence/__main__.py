@@ -1,4 +1,4 @@
-"""Run the missing measurements of the five studies, and write docs/evidence.md with its plots.
+"""Run the missing measurements of a study, and write docs/evidence.md with its plots.
 
     python evidence --table                     # write tables and plots from results/*.json (make evidence)
     python evidence --only look --seeds 1       # run a part of the methods study; finished cells are skipped
@@ -6,12 +6,14 @@
     python evidence --study labs                # adapt to twelve random labs
     python evidence --study rates               # compare learning rates for the labs study in two other labs
     python evidence --study iterations          # compare searches of different sizes
+    python evidence --study widths              # fine-tune predictors of three widths with several ranks
 
 The methods study compares methods that adapt a base model to a changed scene. The selection study compares metrics that
 select a checkpoint. The labs study asks whether adapting helps in a new lab, and whether the advice of the tool is
 good. The rates study compares learning rates for the labs study on held-out episodes of other labs, without any goal.
-The iterations study asks how many action sequences and iterations a decision needs. A finished measurement is a JSON
-file in the work folder; the values that the tables need are written to evidence/results.
+The iterations study asks how many action sequences and iterations a decision needs.
+The widths study asks which rank LoRA needs. A finished measurement
+is a JSON file in the work folder; the values that the tables need are written to evidence/results.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +55,8 @@ def write(folder: Path) -> None:
     import selection
     import selection_tables
     import tables
+    import widths
+    import widths_tables
 
     stored, docs = results.RESULTS, ROOT / "docs"
     counts = []
@@ -61,6 +66,7 @@ def write(folder: Path) -> None:
         ("labs", labs.compact, labs.name_of, labs_tables.write_tables),
         ("rates", labs.compact, rates.name_of, rates.write_tables),
         ("iterations", iterations.compact, iterations.name_of, iterations_tables.write_tables),
+        ("widths", widths.compact, widths.name_of, widths_tables.write_tables),
     ):
         measured = results.read_all(folder / study, stored / f"{study}.json", compact, name_of)
         if measured:
@@ -155,12 +161,27 @@ def _run_iterations(options: argparse.Namespace) -> int:
     return failed + _in_processes(measure, [(cell, options.folder, options.goals) for cell in cells], options)
 
 
+def _run_with_base_models(options: argparse.Namespace) -> int:
+    """Run a study that trains its own base models."""
+    from results import RESULTS
+
+    study = import_module(options.study)
+    cells = _missing(list(study.all_cells()), RESULTS / f"{options.study}.json", study.name_of, options)
+    if not cells:
+        return 0
+    study.prepare_data(options.folder, options.workers)
+    bases = list(dict.fromkeys(cell.base for cell in cells))
+    failed = _in_processes(study.prepare, [(base, options.folder) for base in bases], options)
+    return failed + _in_processes(study.measure, [(cell, options.folder, options.goals) for cell in cells], options)
+
+
 STUDIES = {
     "methods": _run_methods,
     "selection": _run_selection,
     "labs": _run_labs,
     "rates": _run_rates,
     "iterations": _run_iterations,
+    "widths": _run_with_base_models,
 }
 
 

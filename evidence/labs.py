@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from measure import describe_software
 from methods import IN_OUT, PLANNING, TRAINING
-from prepare import BUILTIN, cache_latents, data_a, exclude_episodes
+from prepare import BUILTIN, base_data, cache_latents, data_a, exclude_episodes, prepare_base_data
 from results import rounded
 
 from vjepa2_ac.config import AdapterConfig, Config, DataConfig, ModelConfig, ValidationConfig
@@ -65,7 +65,6 @@ METHODS = (
 """Both priors act without a search, so they are goal-conditioned behaviour cloning. The pre-trained prior starts from
 the weights of a prior that was trained on the training data of the base model, as LoRA starts from the base model."""
 
-BASE_EPISODES, BASE_SEED = 800, 3  # the training data of the base model, as configs/demo_base.yaml records them
 BASE_PRIOR = PriorOptions(steps=8_000)
 FINE_TUNING = PriorOptions(steps=500, learning_rate=3e-4)
 """Training of a prior on the base model's data, and its fine-tuning in a lab. Both are assumed, not yet chosen:
@@ -135,22 +134,15 @@ def prepare(lab: Lab, folder: Path) -> None:
 def prepare_base_prior(folder: Path, workers: int = 1) -> None:
     """Record and encode the training data of the base model, and train an action prior on them, if missing."""
     torch.set_num_threads(1)
-    data = _base_data(folder)
-    if not Path(data.path).exists():
-        record_dataset(data.path, RecordingSpec("random", seed=BASE_SEED), episodes=BASE_EPISODES, workers=workers)
+    prepare_base_data(folder, workers)
     if not _base_prior(folder).exists():
-        cache_latents(data, BUILTIN)
         train_prior(make_base_config(folder), _base_prior(folder), BASE_PRIOR)
 
 
 def make_base_config(folder: Path) -> Config:
     """Return a config of the base model's training data, to train an action prior on them."""
     model = ModelConfig(base=BUILTIN, dtype="float32")
-    return Config(run_dir="none", data=_base_data(folder), model=model, training=TRAINING)
-
-
-def _base_data(folder: Path) -> DataConfig:
-    return data_a(folder).model_copy(update={"path": str(folder / "data-base")})
+    return Config(run_dir="none", data=base_data(folder), model=model, training=TRAINING)
 
 
 def _base_prior(folder: Path) -> Path:
@@ -192,7 +184,7 @@ def make_config(cell: Cell, folder: Path) -> Config:
 def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Train and measure a cell on one thread."""
     torch.set_num_threads(1)
-    config, closed_loop = make_config(cell, folder), _closed_loop(cell, goals)
+    config, reach = make_config(cell, folder), closed_loop(cell, goals)
     result: dict[str, Any] = {
         "cell": asdict(cell),
         "condition": get_lab(cell.lab).condition,
@@ -201,15 +193,15 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     base = load_base(config.model, seed=config.seed).eval()
     if cell.method == "base model":
         policies = (ZeroActions(), RandomActions(PLANNING.limits, cell.lab), Oracle(PLANNING.limits))
-        result["closed_loop"] = {policy.name: closed_loop(policy) for policy in policies}
-        result["closed_loop"]["newest"] = closed_loop(Planning(Controller(base, PLANNING)))
+        result["closed_loop"] = {policy.name: reach(policy) for policy in policies}
+        result["closed_loop"]["newest"] = reach(Planning(Controller(base, PLANNING)))
     elif cell.method == "test-time adaptation":
-        result["closed_loop"] = {"newest": closed_loop(AdaptingPlanner(base))}
+        result["closed_loop"] = {"newest": reach(AdaptingPlanner(base))}
     elif cell.method in {PRIOR, PRETRAINED_PRIOR}:
         prior = folder / "lab-runs" / cell.name
         result["held_out"] = dict(train_prior(config, prior, make_prior_options(cell.method, folder)).held_out)
         planning = PLANNING.model_copy(update={"planner": Component("prior"), "prior": str(prior)})
-        result["closed_loop"] = {"newest": closed_loop(Planning(Controller(base, planning)))}
+        result["closed_loop"] = {"newest": reach(Planning(Controller(base, planning)))}
     else:
         run = train(config, SILENT)
         selected, newest = (select_checkpoint(run, name).path.name for name in (SELECTED, NEWEST))
@@ -217,9 +209,9 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
         for name in dict.fromkeys((NEWEST, SELECTED)):
             if name == SELECTED and selected == newest:
                 continue
-            result["evaluation"][name] = _evaluate(run, name)
+            result["evaluation"][name] = evaluate(run, name)
             model = load_subject(run, name).world_model
-            result["closed_loop"][name] = closed_loop(Planning(Controller(model, PLANNING)))
+            result["closed_loop"][name] = reach(Planning(Controller(model, PLANNING)))
     return result
 
 
@@ -233,7 +225,7 @@ def compact(result: dict[str, Any]) -> dict[str, Any]:
     return rounded(result)  # type: ignore[no-any-return]  # a mapping stays a mapping
 
 
-def _closed_loop(cell: Cell, goals: int) -> Any:
+def closed_loop(cell: Cell, goals: int) -> Any:
     """Return a function that measures a policy on the goals of a lab: the final distances to the goal (cm)."""
     spec = BenchmarkOptions("reach", get_lab(cell.lab).domain, goals, GOALS_SEED + GOALS_STEP * cell.lab)
 
@@ -243,7 +235,7 @@ def _closed_loop(cell: Cell, goals: int) -> Any:
     return measure_policy
 
 
-def _evaluate(run: Path, checkpoint: str) -> dict[str, Any]:
+def evaluate(run: Path, checkpoint: str) -> dict[str, Any]:
     """Return the verdicts of `evaluate` on the held-out test episodes, and its rows."""
     probes = ProbeOptions(samples=32, landscape_clips=8, nodes=7, examples=0)
     evaluation = evaluate_subject(str(run), EvaluationOptions(clips=128, checkpoint=checkpoint, probes=probes))

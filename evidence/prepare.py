@@ -48,6 +48,20 @@ def data_a(folder: Path) -> DataConfig:
     )
 
 
+def base_data(folder: Path) -> DataConfig:
+    """Return the training data of the built-in base model."""
+    return data_a(folder).model_copy(update={"path": str(folder / "data-base")})
+
+
+def prepare_base_data(folder: Path, workers: int) -> None:
+    """Record and encode the training data of the built-in base model, if missing."""
+    data = base_data(folder)
+    if not Path(data.path).exists():
+        spec = RecordingSpec("random", seed=3)  # as in the comment of configs/demo_base.yaml
+        record_dataset(data.path, spec, episodes=800, workers=workers)
+    cache_latents(data, BUILTIN)
+
+
 def data_before(folder: Path, shift: str) -> DataConfig:
     """Return the data on which the one-camera base model was trained, before a domain shift."""
     return data_a(folder) if shift in SHIFTS else data_of(folder, shift, "before")

@@ -19,10 +19,7 @@ from vjepa2_ac.config import ValidationConfig
 from vjepa2_ac.policies.action_prior import PriorOptions, load_prior, train_prior
 from vjepa2_ac.simulation.record import RecordingSpec
 
-MODULES = (
-    "environments", "methods", "prepare", "offline", "results", "measure", "tables", "selection",
-    "selection_tables", "labs", "labs_tables", "rates", "iterations", "iterations_tables", "pretrain_encoder",
-)  # fmt: skip
+MODULES = tuple(sorted(path.stem for path in (ROOT / "evidence").glob("[!_]*.py")))
 
 
 @pytest.fixture(scope="module")
@@ -410,3 +407,24 @@ def test_mask_covers_the_required_fraction_in_blocks(evidence: Any) -> None:
     assert masks.shape == (50, 36)
     assert masks.mean(axis=1).min() >= evidence.pretrain_encoder.MASKED
     assert masks.mean(axis=1).max() < 1
+
+
+def test_rank_table_shows_which_part_of_the_improvement_of_full_fine_tuning_a_rank_gives(evidence: Any) -> None:
+    widths, tables = evidence.widths, evidence.widths_tables
+    cells = {}
+    for method in widths.METHODS:
+        trained = {"full fine-tuning": 0.6, "LoRA, rank 4": 0.7}.get(method, 0.8)
+        values = {"base": 1.0, "adapter": trained}
+        rows = {f"{name} {key}": value for name, value in values.items() for key in (tables.ERROR, tables.RANKING)}
+        cells[128, method] = [{"rows": rows, "ends_cm": [1.0, 9.0]} for _ in widths.LABS]
+    rows = {line.split("|")[1].strip(): line for line in tables.rank_table(cells, [128]).splitlines()}
+    assert "| 50 % (19 to 81) | 70.0 % (75 % of full) |" in rows["LoRA, rank 4"]
+    assert "| 100.0 % | 100.0 % |" in rows["base model"]
+
+
+def test_base_models_of_all_widths_share_the_encoder_and_the_depth(evidence: Any) -> None:
+    widths = evidence.widths
+    models = [widths._make_fresh_model(width) for width in widths.WIDTHS]
+    assert [model.sizes.predictor.width for model in models] == list(widths.WIDTHS)
+    assert {model.sizes.predictor.depth for model in models} == {widths.DEPTH}
+    assert len({model.encoder_fingerprint() for model in models}) == 1
