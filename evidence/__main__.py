@@ -7,12 +7,14 @@
     python evidence --study rates               # compare learning rates for the labs study in two other labs
     python evidence --study iterations          # compare searches of different sizes
     python evidence --study widths              # fine-tune predictors of three widths with several ranks
+    python evidence --study bases               # adapt other base models, with random and pre-trained encoders
 
 The methods study compares methods that adapt a base model to a changed scene. The selection study compares metrics that
 select a checkpoint. The labs study asks whether adapting helps in a new lab, and whether the advice of the tool is
 good. The rates study compares learning rates for the labs study on held-out episodes of other labs, without any goal.
 The iterations study asks how many action sequences and iterations a decision needs.
-The widths study asks which rank LoRA needs. A finished measurement
+The widths study asks which rank LoRA needs, and the bases study whether the results depend on the base model and its
+encoder. A finished measurement
 is a JSON file in the work folder; the values that the tables need are written to evidence/results.
 """
 
@@ -46,6 +48,8 @@ def main() -> int:
 
 def write(folder: Path) -> None:
     """Write the results, tables and plots of all measurements."""
+    import bases
+    import bases_tables
     import iterations
     import iterations_tables
     import labs
@@ -67,6 +71,7 @@ def write(folder: Path) -> None:
         ("rates", labs.compact, rates.name_of, rates.write_tables),
         ("iterations", iterations.compact, iterations.name_of, iterations_tables.write_tables),
         ("widths", widths.compact, widths.name_of, widths_tables.write_tables),
+        ("bases", bases.compact, bases.name_of, bases_tables.write_tables),
     ):
         measured = results.read_all(folder / study, stored / f"{study}.json", compact, name_of)
         if measured:
@@ -182,6 +187,7 @@ STUDIES = {
     "rates": _run_rates,
     "iterations": _run_iterations,
     "widths": _run_with_base_models,
+    "bases": _run_with_base_models,
 }
 
 

@@ -124,7 +124,7 @@ def all_cells() -> Iterator[Cell]:
 def prepare(lab: Lab, folder: Path) -> None:
     """Record the demonstrations and the held-out episodes of a lab, and encode them."""
     torch.set_num_threads(1)
-    data = _make_data_config(lab, folder)
+    data = make_data_config(lab, folder)
     if not Path(data.path).exists():
         spec = RecordingSpec(lab.domain, seed=SEED + lab.number, recipe=lab.recipe)
         record_dataset(data.path, spec, episodes=EPISODES)
@@ -154,7 +154,8 @@ def make_prior_options(method: str, folder: Path) -> PriorOptions:
     return replace(FINE_TUNING, pretrained=_base_prior(folder)) if method == PRETRAINED_PRIOR else PriorOptions()
 
 
-def _make_data_config(lab: Lab, folder: Path) -> DataConfig:
+def make_data_config(lab: Lab, folder: Path) -> DataConfig:
+    """Return the data of a lab; one half of the episodes is for training, the other half is held out."""
     update = {"path": str(folder / f"data-{lab.number}"), "validation_share": 0.2, "test_share": 0.3}
     return data_a(folder).model_copy(update=update)
 
@@ -162,7 +163,7 @@ def _make_data_config(lab: Lab, folder: Path) -> DataConfig:
 def make_config(cell: Cell, folder: Path) -> Config:
     """Return the config of a cell. Every 100 steps and before the first step the model is validated."""
     lab = get_lab(cell.lab)
-    data = _make_data_config(lab, folder)
+    data = make_data_config(lab, folder)
     excluded = exclude_episodes(data, lab.demonstrations, cell.lab)
     rank = int(cell.method.rpartition(" ")[2]) if cell.method.startswith("LoRA") else 0
     rate = 3e-3 if rank else 4e-3
@@ -260,9 +261,9 @@ ROWS = (
     "ranking.spread",
     "one_step.true",
     "gap_of_actions.shuffled",
-    "landscape.offset",
-    "landscape.sharpness",
-    "distribution.spread.3",
+    "landscapes.distance",
+    "landscapes.sharpness",
+    "spread.3",
 )
 
 

@@ -1,7 +1,4 @@
-"""Pre-train the tiny encoder on simulated frames, and write it with a random predictor as a model folder.
-
-    python evidence/pretrain_encoder.py --objective pixels build/evidence/encoder-pixels
-    vjepa2-ac train builtin:demo_base model.base=build/evidence/encoder-pixels run_dir=build/evidence/base-pixels
+"""Pre-train the tiny encoder on simulated frames.
 
 pixels: the encoder predicts the normalised pixels of masked patches (He et al. 2022, arXiv 2111.06377, but with mask
 tokens in the encoder, as in SimMIM, arXiv 2111.09886). latents: it predicts the latents that a moving average of itself
@@ -11,7 +8,6 @@ frames show other scenes than those of the base model and of the experiments, wi
 
 from __future__ import annotations
 
-import argparse
 import copy
 import math
 import os
@@ -23,15 +19,13 @@ import numpy as np
 import torch
 from einops import rearrange
 from jaxtyping import Bool, Float, UInt8
-from prepare import BUILTIN
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, l1_loss, mse_loss
 
 from vjepa2_ac import read_clips
-from vjepa2_ac.config import ModelConfig, RldsData
+from vjepa2_ac.config import RldsData
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.transforms import pixels_to_input
-from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.predictor import normalise_latents
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.simulation.domains import DomainRanges
@@ -51,24 +45,10 @@ RECORDINGS = (  # specification, number of episodes, frames per clip, stride
     (RecordingSpec(SCENES, steps=41, seed=102, task="push"), 400, 8, 5),
     (RecordingSpec(SCENES, steps=41, seed=103, task="pick"), 400, 8, 5),
 )
-STEPS, BATCH, RATE, WARMUP, DECAY = 6_000, 64, 1e-3, 200, 0.04
+STEPS, BATCH, RATE, WARMUP, DECAY = 12_000, 64, 1e-3, 200, 0.04
 MASKED, LARGEST_BLOCK = 0.6, 3  # smallest masked fraction of the patches, and largest side of a masked block
 AVERAGE = 0.99  # of the weights of the target encoder, at the start; it rises to 1
 HELD_OUT, REPORT_EVERY = 256, 200
-
-
-def main() -> None:
-    """Record the missing frames, train the encoder, and write the model."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--objective", choices=("pixels", "latents"), required=True)
-    parser.add_argument("--frames", type=Path, default=Path("build/evidence/video"), help="folder of the recordings")
-    parser.add_argument("--steps", type=int, default=STEPS)
-    parser.add_argument("folder", type=Path, help="output folder of the model")
-    options = parser.parse_args()
-    sizes = load_base(ModelConfig(base=BUILTIN, dtype="float32"), seed=0).sizes
-    model = WorldModel.random(sizes, seed=0, near_persistence=True)
-    pretrain(model, read_frames(options.frames, model.image_size), options.objective, options.steps)
-    model.save_pretrained(options.folder)
 
 
 def read_frames(folder: Path, size: int) -> UInt8[Tensor, "frames 3 size size"]:
@@ -129,17 +109,17 @@ def encode(
     return vit.layernorm(tokens)
 
 
-def pretrain(model: WorldModel, frames: UInt8[Tensor, "frames 3 size size"], objective: str, steps: int) -> None:
+def pretrain(model: WorldModel, frames: UInt8[Tensor, "frames 3 size size"], objective: str, seed: int) -> None:
     """Train the encoder of a model in place."""
-    torch.manual_seed(0)
+    torch.manual_seed(seed)
     patch, side = model.sizes.patch_size, model.image_size // model.sizes.patch_size
     student = MaskedEncoder(model, model.latent_dim if objective == "latents" else 3 * patch**2)
     target = copy.deepcopy(student.vit).requires_grad_(False)
     optimizer = torch.optim.AdamW(student.parameters(), lr=RATE, weight_decay=DECAY, betas=(0.9, 0.95))
     held_out, frames = frames[:HELD_OUT], frames[HELD_OUT:]
-    rng, started = np.random.default_rng(0), time.monotonic()
-    for step in range(1, steps + 1):
-        cosine = 0.5 + 0.5 * math.cos(math.pi * step / steps)
+    rng, started = np.random.default_rng(seed), time.monotonic()
+    for step in range(1, STEPS + 1):
+        cosine = 0.5 + 0.5 * math.cos(math.pi * step / STEPS)
         for group in optimizer.param_groups:
             group["lr"] = RATE * min(1.0, step / WARMUP) * cosine
         batch = _normalised(frames[torch.from_numpy(rng.integers(len(frames), size=BATCH))], model.image_size)
@@ -193,7 +173,3 @@ def _patch_pixels(frames: Float[Tensor, "batch 3 size size"], patch: int) -> Flo
 def _update_average(average: nn.Module, module: nn.Module, weight: float) -> None:
     for old, new in zip(average.parameters(), module.parameters(), strict=True):
         old.lerp_(new, 1.0 - weight)
-
-
-if __name__ == "__main__":
-    main()

@@ -45,20 +45,6 @@ BASE_STEPS, BASE_RATE = 5_000, 1.5e-3
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One method in one lab, with the predictor of one width."""
-
-    width: int
-    lab: int
-    method: str
-
-    @property
-    def name(self) -> str:
-        """Name of its file."""
-        return f"width-{self.width}-lab-{self.lab:02d}-{self.method.replace(', ', '-').replace(' ', '-')}"
-
-
-@dataclass(frozen=True)
 class BaseModel:
     """A base model that is pre-trained."""
 
@@ -70,17 +56,36 @@ class BaseModel:
         return f"base model of width {self.width}"
 
 
+@dataclass(frozen=True)
+class Cell:
+    """One method in one lab, with the predictor of one width."""
+
+    width: int
+    lab: int
+    method: str
+
+    @property
+    def base(self) -> BaseModel:
+        """The base model."""
+        return BaseModel(self.width)
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return f"width-{self.width}-lab-{self.lab:02d}-{self.method.replace(', ', '-').replace(' ', '-')}"
+
+
 def all_cells() -> Iterator[Cell]:
-    """Yield all cells, the narrow predictors first."""
-    for width in WIDTHS:
+    """Yield all cells, the wide predictors first, because they take longer."""
+    for width in reversed(WIDTHS):
         for lab in LABS:
             for method in METHODS:
                 yield Cell(width, lab, method)
 
 
-def prepare_data(folder: Path) -> None:
+def prepare_data(folder: Path, workers: int) -> None:
     """Record and encode the training data of the base models, and the demonstrations of the labs."""
-    prepare_base_data(folder)
+    prepare_base_data(folder, workers)
     for number in LABS:
         prepare_lab(get_lab(number), folder)
 

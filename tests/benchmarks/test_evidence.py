@@ -428,3 +428,11 @@ def test_base_models_of_all_widths_share_the_encoder_and_the_depth(evidence: Any
     assert [model.sizes.predictor.width for model in models] == list(widths.WIDTHS)
     assert {model.sizes.predictor.depth for model in models} == {widths.DEPTH}
     assert len({model.encoder_fingerprint() for model in models}) == 1
+
+
+def test_cells_of_the_studies_with_own_base_models_have_distinct_names(evidence: Any, tmp_path: Path) -> None:
+    for study in (evidence.widths, evidence.bases):
+        cells = list(study.all_cells())
+        assert len({cell.name for cell in cells}) == len(cells)
+    builtin = [base for base in evidence.bases.BASES if evidence.bases.BaseModel(*base).location(tmp_path)[:1] != "/"]
+    assert builtin == [("random", 0)]
