@@ -33,7 +33,10 @@ SHORT = ("zero-shot", AXES, BEST, LONGER, "full", "scratch", "scratch, 3x steps"
 Correlated = dict[str, tuple[int, dict[str, dict[str, float]]]]  # by change: number of cells, and an interval by name
 SHOWN_TASKS = {"Lift": "Lift", "LIBERO-object": "LIBERO-Spatial, objects changed"}
 """The tasks in which methods differ, and their titles. The page has one sentence about the others."""
-MARKS = {name: f"{name}, made by `make evidence`" for name in ("success", "metrics", "choice", "environments")}
+MARKS = {
+    name: f"{name}, made by `make evidence`"
+    for name in ("success", "difference", "metrics", "choice", "adapters", "environments")
+}
 OFFLINE = {  # numbers in the short table of correlations
     "cost of wrong actions, negative": "growth of the one-step error with shuffled actions",
     "action-ranking error": "**action-ranking error**",
@@ -69,7 +72,9 @@ def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:
     texts = {
         "success": summary(results),
         "metrics": summary_of_correlations(correlated),
+        "difference": difference_table(results),
         "choice": choice_table(results),
+        "adapters": choice_table([result for result in results if result["cell"]["episodes"]]),
         "environments": summary_of_tasks(results),
     }
     for part, table in texts.items():
@@ -216,6 +221,20 @@ def goal_by_goal(results: Sequence[Figures]) -> str:
     tests = "p over seeds | p over goals | p over goals, corrected"
     head = f"{title}\n\n| {heads} | {tests} |\n|" + "---|" * 8
     return "\n".join([head, *rows]) if rows else ""
+
+
+def difference_table(results: Sequence[Figures]) -> str:
+    """Return the success rate of LoRA minus that of full fine-tuning, with an interval over goals."""
+    rows = ["| Domain shift, base model | difference in points | 95 % interval |", "|---|---|---|"]
+    titles = CHANGES | SHOWN_TASKS
+    for shift in (*SHIFTS, *SHOWN_TASKS):
+        for base in BASES if shift in SHIFTS else BASES[:1]:
+            pairs = [pair for seed in _pairs(results, shift, base, "full") for pair in seed]
+            if pairs:
+                differences = [100.0 * (ours - theirs) for ours, theirs in pairs]
+                label = f"{titles[shift]}{f', {BASE_MODELS[base]}' * (shift in SHIFTS)}"
+                rows.append(f"| {label} | {_mean_cells(differences, '+.0f')} |")
+    return "\n".join(rows)
 
 
 def correct_by_holm(p_values: Sequence[float]) -> list[float]:

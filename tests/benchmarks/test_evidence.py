@@ -59,6 +59,8 @@ def test_tables_of_the_page_equal_the_stored_results(evidence: Any, stored: Any)
     assert evidence.tables.summary_of_tasks(stored) in page
     assert evidence.tables.summary_of_correlations(evidence.tables.correlated_numbers(stored)) in page
     assert evidence.tables.choice_table(stored) in page
+    assert evidence.tables.choice_table([result for result in stored if result["cell"]["episodes"]]) in page
+    assert evidence.tables.difference_table(stored) in page
     text = (evidence.results.RESULTS / "methods.md").read_text()
     assert "\n\n".join(evidence.tables._rows(stored)) in text
     assert evidence.tables.goal_by_goal(stored) in text
