@@ -12,10 +12,9 @@
 The methods study compares methods that adapt a base model to a changed scene. The selection study compares metrics that
 select a checkpoint. The labs study asks whether adapting helps in a new lab, and whether the advice of the tool is
 good. The rates study compares learning rates for the labs study on held-out episodes of other labs, without any goal.
-The iterations study asks how many action sequences and iterations a decision needs.
-The widths study asks which rank LoRA needs, and the bases study whether the results depend on the base model and its
-encoder. A finished measurement
-is a JSON file in the work folder; the values that the tables need are written to evidence/results.
+The iterations study asks how many action sequences and iterations a decision needs. The widths study asks which rank
+LoRA needs. The bases study asks whether the results depend on the base model and its encoder. A finished measurement is
+a JSON file in the work folder; the values that the tables need are written to evidence/results.
 """
 
 from __future__ import annotations
