@@ -8,13 +8,15 @@
     python evidence --study iterations          # compare searches of different sizes
     python evidence --study widths              # fine-tune predictors of three widths with several ranks
     python evidence --study bases               # adapt other base models, with random and pre-trained encoders
+    python evidence --study variants            # compare six training losses
 
 The methods study compares methods that adapt a base model to a changed scene. The selection study compares metrics that
 select a checkpoint. The labs study asks whether adapting helps in a new lab, and whether the advice of the tool is
 good. The rates study compares learning rates for the labs study on held-out episodes of other labs, without any goal.
 The iterations study asks how many action sequences and iterations a decision needs. The widths study asks which rank
-LoRA needs. The bases study asks whether the results depend on the base model and its encoder. A finished measurement is
-a JSON file in the work folder; the values that the tables need are written to evidence/results.
+LoRA needs. The bases study asks whether the results depend on the base model and its encoder. The variants study
+compares training losses. A finished measurement is a JSON file in the work folder; the values that the tables need are
+written to evidence/results.
 """
 
 from __future__ import annotations
@@ -58,6 +60,8 @@ def write(folder: Path) -> None:
     import selection
     import selection_tables
     import tables
+    import variants
+    import variants_tables
     import widths
     import widths_tables
 
@@ -71,6 +75,7 @@ def write(folder: Path) -> None:
         ("iterations", iterations.compact, iterations.name_of, iterations_tables.write_tables),
         ("widths", widths.compact, widths.name_of, widths_tables.write_tables),
         ("bases", bases.compact, bases.name_of, bases_tables.write_tables),
+        ("variants", variants.compact, variants.name_of, variants_tables.write_tables),
     ):
         measured = results.read_all(folder / study, stored / f"{study}.json", compact, name_of)
         if measured:
@@ -179,6 +184,16 @@ def _run_with_base_models(options: argparse.Namespace) -> int:
     return failed + _in_processes(study.measure, [(cell, options.folder, options.goals) for cell in cells], options)
 
 
+def _run_variants(options: argparse.Namespace) -> int:
+    from results import RESULTS
+    from variants import Seed, all_cells, measure, name_of, prepare
+
+    cells = _missing(list(all_cells(options.seeds)), RESULTS / "variants.json", name_of, options)
+    seeds = [Seed(number) for number in sorted({cell.seed for cell in cells})]
+    failed = _in_processes(prepare, [(seed, options.folder) for seed in seeds], options)
+    return failed + _in_processes(measure, [(cell, options.folder, options.goals) for cell in cells], options)
+
+
 STUDIES = {
     "methods": _run_methods,
     "selection": _run_selection,
@@ -187,6 +202,7 @@ STUDIES = {
     "iterations": _run_iterations,
     "widths": _run_with_base_models,
     "bases": _run_with_base_models,
+    "variants": _run_variants,
 }
 
 
