@@ -44,6 +44,7 @@ MEASURES = (
     Measure("rollout error / persistence, 3 steps", lambda result: float(result["rollout_over_persistence"][2])),
     Measure("rollout error / persistence, 10 steps", lambda result: float(result["rollout_over_persistence"][-1])),
 )
+SHARE = Measure("common part of the squared error, %", lambda result: 100 * float(result["common_share"]), form=".0f")
 NOTES = """- Each seed has its own target domain, demonstrations, order of clips and goals.
 - *Difference*: mean over seeds of method minus reference, with the interval of Student's t over the seeds. These
   intervals are not corrected for the number of comparisons.
@@ -125,14 +126,15 @@ def decision_table(methods: Results) -> str:
 
 def means_table(methods: Results) -> str:
     """Return each measure of each method, as the mean over seeds."""
+    measures = (*MEASURES, SHARE)
     rows = [
         (
             name,
-            *(f"{np.mean([measure.read(result) for result in seeds.values()]):{measure.form}}" for measure in MEASURES),
+            *(f"{np.mean([measure.read(result) for result in seeds.values()]):{measure.form}}" for measure in measures),
         )
         for name, seeds in methods.items()
     ]
-    return _format_table(("method", *(measure.title for measure in MEASURES)), rows)
+    return _format_table(("method", *(measure.title for measure in measures)), rows)
 
 
 def differences_table(methods: Results, references: Mapping[str, str]) -> str:

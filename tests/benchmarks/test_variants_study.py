@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
@@ -177,17 +178,18 @@ def test_cell_is_trained_and_measured(study: Any, recorded: Path, monkeypatch: p
     assert set(result["training"]) == {"forced", "rollout", "variants", "contrast"}
     assert len(result["rollout_over_persistence"]) == 10
     assert len(result["ends_cm"]) == 1
-    assert all(measure.read(result) >= 0 for measure in study.variants_tables.MEASURES)
+    assert all(measure.read(result) >= 0 for measure in (*study.variants_tables.MEASURES, study.variants_tables.SHARE))
 
 
 def _result(method: str, seed: int, reached: int) -> dict[str, Any]:
-    errors = {"common_error": 0.5, "relative_error": 0.5, "action_ranking_error": 0.2, "auroc_by_family": {}}
+    errors = {"common_error": 0.5, "relative_error": 0.5, "common_share": 0.6, "action_ranking_error": 0.2}
     return {
         "cell": {"method": method, "seed": seed},
         "ends_cm": [1.0] * reached + [9.0] * (20 - reached),
         "rollout_over_persistence": [0.7] * 10,
         "auroc": 0.8,
         "auroc_same_start": 0.9,
+        "auroc_by_family": defaultdict(lambda: 0.7),
         **errors,
     }
 
@@ -218,7 +220,7 @@ def test_method_is_kept_only_if_it_gains_beyond_its_interval(
     assert row.endswith({True: "| yes |", False: "| no |", None: "| undecided |"}[kept])
 
 
-def test_interval_is_that_of_students_t(study: Any) -> None:
+def test_tables_have_the_interval_of_students_t(study: Any, tmp_path: Path) -> None:
     tables, variants = study.variants_tables, study.variants
     results = [
         _result(name, seed, 10 + (seed if name == "contrast" else 0))
@@ -229,4 +231,8 @@ def test_interval_is_that_of_students_t(study: Any) -> None:
     difference = tables.estimate_difference(methods, tables.SUCCESS, "contrast", variants.BASELINE)
     half = 2.776445 * 5 * np.std(np.arange(5), ddof=1) / np.sqrt(5)  # t(0.975; 4); one goal is 5 points
     assert [difference.value, difference.low, difference.high] == pytest.approx([10.0, 10 - half, 10 + half], rel=1e-5)
+    tables.write_tables(results, tmp_path / "variants.md", tmp_path)
+    text = (tmp_path / "variants.md").read_text()
+    assert "| contrast | success rate, % | +10.0 | +0.2 to +19.8 | yes |" in text
+    assert "| contrast | +10.0 points | +0.2 to +19.8 | failing variants as data | yes |" in text
     assert tables.group_by_method(results[:-1])[variants.BASE].keys() == {0, 1, 2, 3}, "incomplete seeds are left out"
