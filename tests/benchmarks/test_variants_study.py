@@ -137,6 +137,7 @@ def test_common_and_relative_error_add_up(study: Any) -> None:
     error = torch.randn(3, 5, 4, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     common, relative = study.variants.split_error(error)
     assert torch.allclose(common + relative, error)
+    assert torch.allclose(relative.mean(dim=1), torch.zeros(3, 4, 6, dtype=torch.float64)), "the mean over alternatives"
     total = common.square().mean() + relative.square().mean()
     assert float(total) == pytest.approx(float(error.square().mean()), rel=1e-12)
     same = torch.ones(2, 5, 4)
