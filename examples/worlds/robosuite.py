@@ -7,7 +7,7 @@ State and targets: the pose of the grip site in the frame of the robot's base (m
 radians), and the gripper position from 0 (open) to 1. All arms have the Panda gripper; the door has no latch.
 """
 
-from serve_environment import serve  # first: it moves this folder behind installed packages
+from serve_environment import get_versions, serve  # first: it moves this folder behind installed packages
 
 # isort: split
 import numpy as np
@@ -78,6 +78,7 @@ class World:
 if __name__ == "__main__":
     options = read_options(__doc__)
     instruction, steps, *_ = TASKS[options.task]
-    name = f"robosuite {robosuite.__version__}"
+    versions = get_versions("robosuite", "mujoco", "numpy")
+    name = f"robosuite {versions['robosuite']} with MuJoCo {versions['mujoco']}"
     serve(World(options), world=name, task=options.task, instruction=instruction, rate_hz=RATE_HZ, steps=steps,
-          expert=True)  # fmt: skip
+          expert=True, versions=versions)  # fmt: skip

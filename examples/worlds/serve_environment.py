@@ -4,6 +4,7 @@ Import it first: it keeps standard output for answers and moves this folder behi
 """
 
 import base64
+import importlib.metadata
 import json
 import os
 import sys
@@ -18,6 +19,11 @@ def send(answer):
     print(json.dumps(answer), file=answers, flush=True)
 
 
+def get_versions(*packages):
+    """Return the versions of installed packages, which are stored with every result."""
+    return {package: importlib.metadata.version(package) for package in packages}
+
+
 def serve(env, **about):
     """Answer requests until the input ends.
 
@@ -25,7 +31,7 @@ def serve(env, **about):
         env: `reset(seed=)` and `step(target)` return the state as observation, and `success` and `distance_m` in info.
             `step(None)` lets the scripted expert act for a control step, and returns its `target` in info. `render()`
             returns the image.
-        about: The first message: world, task, rate_hz, steps, instruction, expert.
+        about: The first message: world, task, rate_hz, steps, instruction, expert, versions.
     """
     send(about)
     for line in sys.stdin:

@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 
 FAULT = sys.argv[1] if len(sys.argv) > 1 else "as it should be"
-ABOUT = {"world": "fake 1.0", "task": "Come", "instruction": "come here", "rate_hz": 10, "steps": 12, "expert": True}
+ABOUT: dict[str, Any] = {
+    "world": "fake 1.0",
+    "task": "Come",
+    "instruction": "come here",
+    "rate_hz": 10,
+    "steps": 12,
+    "expert": True,
+}
+ABOUT["versions"] = {"mujoco": "3.0"}
 REACH_M = 0.03  # largest motion per control step
 
 

@@ -22,11 +22,14 @@ if TYPE_CHECKING:
     from typing import Any
 
     from vjepa2_ac.evaluation.summary import Summary, Verdict
+    from vjepa2_ac.reporter import Reporter
     from vjepa2_ac.runs.subject import Subject
     from vjepa2_ac.serving.metadata import NamedGoals
     from vjepa2_ac.serving.session import Session
     from vjepa2_ac.simulation.benchmark import BenchmarkOptions, ClosedLoopBenchmark
-    from vjepa2_ac.simulation.manifest import Manifest
+    from vjepa2_ac.simulation.manifest import Manifest, WorldManifest
+    from vjepa2_ac.simulation.rollout import ClosedLoopResult
+    from vjepa2_ac.simulation.worlds import ExternalEnvironment
 
 _RECORD_OPTIONS = ("cameras", "workers")
 _MANIFEST_OPTIONS = ("task", "domain", "episodes", "steps", "seed", "sub_goals")
@@ -189,7 +192,6 @@ def _simulate(options: argparse.Namespace) -> int:
     """
     if options.world is not None:
         _require_unset(options, ("task", "domain"), problem="--world, which defines task and scene itself")
-        _require_unset(options, ("manifest",), problem="--world, whose problems are determined by --seed")
     elif options.world_timeout is not None:
         raise InputError(where="--world-timeout", found="no --world", needed="--world COMMAND, whose answers it limits")
     if options.subject == "record":
@@ -278,11 +280,14 @@ def _require_benchmark(options: argparse.Namespace) -> None:
     cli.read_planning_config(options)
 
 
-def _measure(options: argparse.Namespace, manifest: Manifest | None) -> tuple[ClosedLoopBenchmark, Path]:
+def _measure(
+    options: argparse.Namespace, manifest: Manifest | WorldManifest | None
+) -> tuple[ClosedLoopBenchmark, Path]:
     """Run the closed-loop benchmark; return its result and the folder for its files."""
     from vjepa2_ac.simulation.benchmark import BenchmarkOptions, require_measured_inputs, run_benchmark
     from vjepa2_ac.simulation.domains import load_mujoco
-    from vjepa2_ac.simulation.worlds import ExternalEnvironment, run_world_benchmark
+    from vjepa2_ac.simulation.manifest import Manifest, WorldManifest
+    from vjepa2_ac.simulation.worlds import ExternalEnvironment
 
     request = cli.make_record(BenchmarkOptions, options)
     request = replace(request, films=min(request.films, request.episodes))
@@ -294,23 +299,25 @@ def _measure(options: argparse.Namespace, manifest: Manifest | None) -> tuple[Cl
             load_mujoco()
         else:
             env = stack.enter_context(ExternalEnvironment(options.world, options.world_timeout))
+            if isinstance(manifest, WorldManifest):
+                manifest.require_environment(env)
             name = re.sub(r"\W+", "-", f"{env.about.task} {env.about.world}", flags=re.ASCII).strip("-")[:200]
         subject, reporter = cli.load_planning_session(options), stack.enter_context(cli.make_reporter())
         require_measured_inputs(subject, world=options.world is not None)
         home = Path(options.subject) if is_run(options.subject) else Path()
         folder = options.out or home / "closed_loop" / name
         cli.make_folder(folder)
-        if options.world is not None:
-            return run_world_benchmark(subject, env, request, reporter), folder
         if manifest is not None:
             manifest.require_stride(subject.config.data.model_stride)
             subject = replace(subject, config=subject.config.model_copy(update={"seed": manifest.planning_seed}))
-        elif options.manifest is not None:
-            _write_manifest(options.manifest, request, subject)
+        if options.world is not None:
+            return _run_in_world(options, manifest, request, subject, env, reporter), folder
+        if options.manifest is not None and manifest is None:
+            _write_manifest(options.manifest, Manifest.of(request, subject))
         return run_benchmark(subject, request, reporter), folder
 
 
-def _read_manifest(options: argparse.Namespace) -> Manifest | None:
+def _read_manifest(options: argparse.Namespace) -> Manifest | WorldManifest | None:
     """Return the manifest and add its settings to the overrides; None if `--manifest` is not set or names a new file.
 
     Raises:
@@ -318,9 +325,14 @@ def _read_manifest(options: argparse.Namespace) -> Manifest | None:
     """
     if options.manifest is None or not options.manifest.exists():
         return None
-    from vjepa2_ac.simulation.manifest import read_manifest
+    from vjepa2_ac.simulation.manifest import WorldManifest, read_manifest
 
     manifest = read_manifest(options.manifest)
+    if isinstance(manifest, WorldManifest) != (options.world is not None):
+        needs_world = options.world is None
+        place = "a third-party environment" if needs_world else "the simulated arm"
+        fix = "Start the environment with --world COMMAND" if needs_world else "Omit --world"
+        raise InputError(where=f"--manifest {options.manifest}", found=f"problems in {place}", fix=fix)
     words = [f"--{name.replace('_', '-')}" for name in _MANIFEST_OPTIONS if getattr(options, name) is not None]
     keys = {f"planning.{key}" for key in manifest.planning}
     words += [word for word in options.overrides if ".".join(word.partition("=")[0].split(".")[:2]) in keys]
@@ -331,11 +343,35 @@ def _read_manifest(options: argparse.Namespace) -> Manifest | None:
     return manifest
 
 
-def _write_manifest(path: Path, request: BenchmarkOptions, subject: Subject) -> None:
-    from vjepa2_ac.simulation.manifest import Manifest
-
-    Manifest.of(request, subject).write(path)
+def _write_manifest(path: Path, manifest: Manifest | WorldManifest) -> None:
+    manifest.write(path)
     cli.show(f"Manifest: {path}. To repeat this measurement, pass --manifest {path}")
+
+
+def _run_in_world(
+    options: argparse.Namespace,
+    manifest: Manifest | WorldManifest | None,
+    request: BenchmarkOptions,
+    subject: Subject,
+    world: ExternalEnvironment,
+    reporter: Reporter,
+) -> ClosedLoopBenchmark:
+    """Run the benchmark in a third-party environment; write its manifest, or report differences from the manifest."""
+    from vjepa2_ac.simulation.manifest import WorldManifest
+    from vjepa2_ac.simulation.worlds import run_world_benchmark
+
+    differences = list[str]()
+
+    def handle_manifest(expert: ClosedLoopResult) -> None:
+        if isinstance(manifest, WorldManifest):
+            lines = (*manifest.describe_versions(world.about), *manifest.describe_starts(expert))
+            differences.extend(f"Difference from the manifest: {line}" for line in lines)
+            cli.show(*differences)
+        elif options.manifest is not None:
+            _write_manifest(options.manifest, WorldManifest.of(request, subject, world, expert))
+
+    benchmark = run_world_benchmark(subject, world, request, reporter, handle_manifest)
+    return replace(benchmark, subject=replace(subject, warnings=(*subject.warnings, *differences)))
 
 
 def _make_summary(benchmark: ClosedLoopBenchmark, verdict: Verdict, options: argparse.Namespace) -> Summary:

@@ -162,6 +162,7 @@ class BenchmarkOptions:
     films: int = 6  # number of first episodes whose frames are stored for a video; 0: no video
     sub_goals: SubGoals = "none"  # sub-goals of the model, from key frames or all steps of the oracle's solution
     problems: tuple[TaskProblem, ...] | None = None  # the problems of a manifest; None: drawn from the seed
+    seeds: tuple[int, ...] | None = None  # the problems of a manifest of a third-party environment
 
     @property
     def world(self) -> Domain:
@@ -182,7 +183,7 @@ class BenchmarkOptions:
         drawn = (make_problem(task, domain, self.seed, index) for index in range(self.episodes))
         problems = drawn if self.problems is None else self.problems
         about = {
-            **{key: value for key, value in vars(self).items() if key not in {"films", "problems"}},
+            **{key: value for key, value in vars(self).items() if key not in {"films", "problems", "seeds"}},
             "domain": domain.name,
             "steps": steps,
             "seconds_per_step": self.stride / CONTROL_RATE_HZ,

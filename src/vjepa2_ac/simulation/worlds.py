@@ -16,9 +16,9 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
 from threading import Thread
@@ -88,7 +88,8 @@ class EnvironmentProcess(ExitStack):
 
     def __init__(self, command: str, timeout_s: float | None = None) -> None:
         super().__init__()
-        self.where, self._timeout_s, self._errors = f"--world {command!r}", timeout_s or _ANSWER_S, b""
+        self.command, self.where = command, f"--world {command!r}"
+        self._timeout_s, self._errors = timeout_s or _ANSWER_S, b""
         try:
             keeper = self._start([sys.executable, "-I", "-S", "-c", _KEEPER], DEVNULL)
             self.callback(keeper.kill)
@@ -187,6 +188,9 @@ def _quote(line: bytes) -> str:
     return repr(line[:_MAX_SHOWN_BYTES].decode(errors="replace").strip())
 
 
+_Short = Annotated[str, Field(max_length=100)]
+
+
 @dataclass(frozen=True)
 class EnvironmentInfo:
     """The first message of a program, which describes its environment."""
@@ -197,6 +201,7 @@ class EnvironmentInfo:
     steps: Annotated[int, Field(ge=1, le=1_000_000)]  # control steps that suffice for the task
     instruction: str = ""  # language instruction
     expert: bool = False  # whether the environment has a scripted expert
+    versions: Annotated[dict[_Short, _Short], Field(max_length=50)] = field(default_factory=dict)  # of its libraries
 
 
 class ExternalEnvironment(EnvironmentProcess):
@@ -283,7 +288,11 @@ def _image(encoded: dict[str, Any]) -> Image:
 
 
 def run_world_benchmark(
-    subject: Subject, world: ExternalEnvironment, options: BenchmarkOptions, reporter: Reporter = SILENT
+    subject: Subject,
+    world: ExternalEnvironment,
+    options: BenchmarkOptions,
+    reporter: Reporter = SILENT,
+    on_problems: Callable[[ClosedLoopResult], None] | None = None,
 ) -> ClosedLoopBenchmark:
     """Run a model, zero actions and random actions on problems that the expert of an environment solves.
 
@@ -292,6 +301,7 @@ def run_world_benchmark(
         world: The environment.
         options: Number and first seed of the problems, and the sub-goals. Task and domain are ignored.
         reporter: Shows the progress of each policy.
+        on_problems: Called with the expert's results, before the model is measured.
 
     Raises:
         InputError: The model needs inputs that such environments do not measure, the environment has no expert, or the
@@ -303,6 +313,8 @@ def run_world_benchmark(
     model = make_policy(subject, None)
     progress = reporter.task(f"{world.about.task}: {Expert.name}")
     trials, expert_result = find_trials(world, options, subject.config.data.model_stride, progress)
+    if on_problems is not None:
+        on_problems(expert_result)
     policies = (model, ZeroActions(), RandomActions(subject.config.planning.limits, options.seed))
     results = run_policies(world, policies, trials, options.films, reporter)
     return ClosedLoopBenchmark(subject, trials, (*results, expert_result))
@@ -312,6 +324,8 @@ def find_trials(
     world: ExternalEnvironment, options: BenchmarkOptions, stride: int, progress: Progress = no_progress
 ) -> tuple[Trials, ClosedLoopResult]:
     """Return the required number of trials that the expert solves, and its results; other trials are left out.
+
+    With the seeds of a manifest, the trials are those of these seeds that the expert solves.
 
     Raises:
         InputError: The expert solves fewer than half of the trials, or there is no expert.
@@ -325,7 +339,8 @@ def find_trials(
         raise world.error(problem, needed)
     steps = options.steps or -(-about.steps // stride)
     trials, episodes, left_out = list[Trial](), list[EpisodeResult](), list[int]()
-    for seed in range(options.seed, options.seed + TRIALS_PER_PROBLEM * options.episodes):
+    seeds = options.seeds or range(options.seed, options.seed + TRIALS_PER_PROBLEM * options.episodes)
+    for seed in seeds:
         episode = run_trial(world, Expert(), Trial(seed, steps, stride), keep_frames=True)
         if not episode.success:
             left_out.append(seed)
@@ -343,14 +358,14 @@ def find_trials(
         progress(len(trials), options.episodes)
         if len(trials) == options.episodes:
             break
-    else:
+    if len(trials) < options.episodes * (1.0 if options.seeds is None else 0.5):
         tried = counted(len(trials) + len(left_out), "problem")
         problem = f"the expert solves {len(trials)} of {tried} in {counted(steps, 'model step')}"
         raise world.error(problem, "at least half of the problems", "Allow more model steps with --steps")
-    selected = {key: getattr(options, key) for key in ("episodes", "seed", "sub_goals")}
-    seeds = {"seeds": [trial.seed for trial in trials], "left_out": left_out}
+    selected = {"episodes": len(trials), "seed": options.seed, "sub_goals": options.sub_goals}
+    numbers = {"seeds": [trial.seed for trial in trials], "left_out": left_out}
     length = {"stride": stride, "steps": steps, "seconds_per_step": stride / about.rate_hz}
-    values = {**vars(about), **selected, **seeds, **length}
+    values = {**vars(about), **selected, **numbers, **length}
     solved = Trials(about.task, about.world, "done", stride / about.rate_hz, tuple(trials), values)
     return solved, ClosedLoopResult(solved, Expert.name, tuple(episodes))
 
