@@ -2,10 +2,13 @@
 
 import json
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -67,3 +70,56 @@ def test_cpu_peak_memory_is_measured_in_a_separate_process_even_if_it_fails(
 ) -> None:
     fields = load("memory").measure_peak_alone([].pop, ["-c", program], "cpu")
     assert fields == {"peak_gb": peak, "problem": problem and f"failed: {problem}"}
+
+
+# ---- versions of MuJoCo ----
+
+
+class FakeWorld:
+    """An environment like that of libero.py: an action moves the object, by a distance that depends on the version."""
+
+    goals = (("on", "bowl", "plate"),)
+
+    def __init__(self, gain: float) -> None:
+        self.env, self.gain = SimpleNamespace(step=self.move), gain
+
+    def reset(self, seed: int) -> tuple[np.ndarray, dict[str, bool]]:
+        self.object = np.array([0.1 * seed, 0.0, 0.0])
+        return self.object, self.info()
+
+    def move(self, action: np.ndarray) -> None:
+        self.object = self.object + self.gain * action
+
+    def step(self, target: None) -> tuple[dict[str, bool]]:  # noqa: ARG002
+        self.env.step(np.array([0.0, 0.0, 0.01]))
+        return (self.info(),)
+
+    def info(self) -> dict[str, bool]:
+        return {"success": bool(self.object[2] > 0.045)}
+
+    def at(self, name: str) -> np.ndarray:
+        assert name == "bowl"
+        return self.object
+
+    def render(self) -> np.ndarray:
+        return np.full((4, 4, 3), 100 if self.gain == 1.0 else 110, dtype=np.uint8)
+
+
+def test_replay_in_its_own_version_has_no_difference_and_in_another_version_it_has(
+    load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    module = load("mujoco_versions")
+    for mujoco, gain in (("3", 1.0), ("4", 0.2)):
+        monkeypatch.setattr(module, "open_world", lambda *_, gain=gain: FakeWorld(gain))
+        monkeypatch.setattr(module, "version", lambda _, mujoco=mujoco: mujoco)
+        monkeypatch.setattr(sys, "argv", ["mujoco_versions", str(tmp_path), "libero", "suite"])
+        module.main()
+    monkeypatch.setattr(sys, "argv", ["mujoco_versions", str(tmp_path)])
+    module.main()
+    rows = capsys.readouterr().out.splitlines()
+    same, nothing = "10 of 10 | 10 of 10", "0.0 (at most 0.0)"
+    assert rows[2] == f"| suite | MuJoCo 3 | MuJoCo 3 | {same} | {nothing} | {nothing} | 0.00 | 0.0 % |"
+    assert rows[3] == (
+        f"| suite | MuJoCo 3 | MuJoCo 4 | 10 of 10 | 0 of 10 | {nothing} | 120.0 (at most 120.0) | 10.00 | 100.0 % |"
+    )
+    assert rows[4] == f"| suite | MuJoCo 4 | MuJoCo 4 | {same} | {nothing} | {nothing} | 0.00 | 0.0 % |"
