@@ -1,18 +1,21 @@
-"""Tasks of third-party environments in the methods study: their changes, recordings and closed loops."""
+"""Tasks of third-party environments in the methods study: their changes, recordings, goals and closed loops."""
 
 from __future__ import annotations
 
 import pickle
 import shlex
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.goals.key_frames import Timing, make_sub_goals, select_every_nth_frame
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions
-from vjepa2_ac.simulation.rollout import ClosedLoopResult, Policy, Trials, run_trials
+from vjepa2_ac.simulation.rollout import ClosedLoopResult, Environment, Image, Policy, Trial, Trials, run_trials
 from vjepa2_ac.simulation.worlds import ExternalEnvironment, find_trials, record_world
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -22,6 +25,13 @@ EPISODES_BEFORE, EPISODES_AFTER = 120, 60  # recorded before and after the chang
 EPISODES_LIFT = 150  # after the change; Lift is also trained on 5 and 80 demonstrations
 CHANGED = ("--camera", "40", "--mount", "20", "--look", "dusk")  # robosuite: another camera, mounting and light
 FIRST = {"before": 0, "after": 10_000}  # seed of the recordings
+SAME, OTHER, ONE_IMAGE = "l1", "another demonstration", "one image"
+GOALS = (SAME, OTHER, ONE_IMAGE)
+"""The goals of a closed loop. l1 (the name in stored results): the frames of the expert's solution of the same problem,
+one for each model step. another demonstration: the frames of the recorded demonstration whose first frame is nearest to
+the first frame of the problem. one image: the last frame of the expert's solution. With frames of a demonstration the
+gripper follows the demonstration; with one image the planner chooses its motion."""
+EXPERT = 0  # kind of a recording without disturbance, by the remainder of its seed divided by three (`worlds`)
 
 
 @dataclass(frozen=True)
@@ -31,8 +41,7 @@ class Task:
     program: str  # name of the program in examples/worlds, and of its virtual environment
     before: tuple[str, ...]
     after: tuple[str, ...]
-    origin: str | None = None  # the task with the same recordings before the change and the same base model
-    seeds: int = 1  # one seed suffices for a task that no method solves
+    seeds: int
 
     @property
     def is_installed(self) -> bool:
@@ -52,21 +61,12 @@ class Task:
 
 TASKS = {
     "Lift": Task("robosuite", ("Lift",), ("Lift", *CHANGED), seeds=5),
-    **{name: Task("robosuite", (name,), (name, *CHANGED)) for name in ("Door", "Stack")},
-    "Lift by a UR5e": Task("robosuite", ("Lift",), ("Lift", "--robot", "UR5e"), origin="Lift"),
-    "LIBERO-swap": Task("libero", ("libero_object", "--near"), ("libero_object_swap", "--near")),
     "LIBERO-object": Task("libero", ("libero_spatial", "--near"), ("libero_spatial_object", "--near"), seeds=3),
 }
 
 
-def origin_of(task: str) -> str:
-    """Return the task whose recordings before the change and base model this task uses."""
-    return TASKS[task].origin or task
-
-
 def data_of(folder: Path, task: str, when: str) -> DataConfig:
     """Return the data config of a task; after the change, two thirds of the episodes are for training."""
-    task = task if when == "after" else origin_of(task)
     held_out = {"validation_share": 0.1, "test_share": 0.1 if when == "before" else 0.25}
     latents = {"cache": "auto", "cache_dir": str(folder / "latents"), "workers": 0}
     path = str(folder / f"data-{task}-{when}")
@@ -100,13 +100,82 @@ def problems(folder: Path, task: str, seed: int, goals: int, when: str = "after"
     return pickle.loads(path.read_bytes())  # type: ignore[no-any-return]  # noqa: S301 - written by this program
 
 
-def closed_loop(
-    folder: Path, task: str, policy: Policy, *, seed: int, goals: int, when: str = "after"
-) -> dict[str, Any]:
-    """Return the results of a policy on the expert's problems, before or after the change."""
+def closed_loops(
+    folder: Path,
+    task: str,
+    policy: Policy,
+    *,
+    seed: int,
+    goals: int,
+    when: str = "after",
+    conditions: Sequence[str] = GOALS,
+) -> dict[str, dict[str, Any]]:
+    """Return the results of a policy on the expert's problems, by kind of goals (`GOALS`).
+
+    `when` is before or after the change. Each result has the versions that the environment reports.
+    """
     trials, expert = problems(folder, task, seed, goals, when)
+    demonstrations = Path(data_of(folder, task, when).path)
     with ExternalEnvironment(TASKS[task].command(when)) as world:
-        return summarize(run_trials(world, policy, trials), expert)
+        loops = {
+            condition: run_trials(world, policy, set_goals(trials, condition, world, demonstrations))
+            for condition in conditions
+        }
+        versions = dict(world.about.versions)
+    return {condition: summarize(loop, expert) | {"versions": versions} for condition, loop in loops.items()}
+
+
+def set_goals(trials: Trials, condition: str, world: Environment, folder: Path) -> Trials:
+    """Return trials with the goals of a condition (`GOALS`).
+
+    Args:
+        trials: Trials with the goals `SAME` and a goal image.
+        condition: The kind of goals.
+        world: The environment, which renders the first frames of the problems.
+        folder: The recordings.
+    """
+    if condition == SAME:
+        return trials
+    demonstrations = read_demonstrations(folder) if condition == OTHER else []
+
+    def goals_of(trial: Trial) -> tuple[SubGoal, ...]:
+        if condition == ONE_IMAGE:
+            assert trial.goal_image is not None, "the last frame of the expert's solution"
+            return (SubGoal(trial.goal_image, gripper="rounded"),)
+        observation, _ = world.reset(seed=trial.seed, options={"stride": trial.stride})
+        return select_nearest(demonstrations, observation.image)
+
+    return replace(trials, trials=tuple(replace(trial, goals=goals_of(trial)) for trial in trials.trials))
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration:
+    """A recorded solution: its first frame, and a goal for each model step."""
+
+    first_frame: Image
+    goals: tuple[SubGoal, ...]
+
+
+def read_demonstrations(folder: Path) -> list[Demonstration]:
+    """Return the undisturbed recordings of the expert that end with success."""
+    demonstrations = []
+    for path in sorted(folder.glob("*.npz")):
+        if int(path.stem.rsplit("_", 1)[1]) % 3 != EXPERT:
+            continue
+        with np.load(path) as recorded:
+            if recorded["success"]:
+                rows = slice(None, None, STRIDE // EVERY)
+                frames, states = recorded["frames"][rows], recorded["states"][rows]
+                keys = select_every_nth_frame(len(frames), 1)
+                goals = make_sub_goals([frames[key.frame] for key in keys], keys, Timing(1, slack=1), states)
+                demonstrations.append(Demonstration(frames[0], goals))
+    return demonstrations
+
+
+def select_nearest(demonstrations: Sequence[Demonstration], frame: Image) -> tuple[SubGoal, ...]:
+    """Return the goals of the demonstration whose first frame is nearest to a frame, in mean absolute difference."""
+    distances = [float(np.abs(each.first_frame.astype(float) - frame).mean()) for each in demonstrations]
+    return demonstrations[int(np.argmin(distances))].goals
 
 
 def summarize(result: ClosedLoopResult, expert: ClosedLoopResult) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
@@ -12,6 +12,7 @@ from typing import Any, get_args
 import environments
 import numpy as np
 import torch
+from environments import GOALS, SAME
 from methods import BEFORE, PLANNING, SHIFTS, Cell, get_method
 from offline import measure_offline
 from prepare import base_model, data_before, data_shifted, encode_clips, exclude_episodes
@@ -51,7 +52,7 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
         result |= {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": (time.process_time() - started) / 60}
         model = load_base(config.model, seed=cell.seed)
         planning = PLANNING.model_copy(update={"planner": Component("prior"), "prior": prior})
-        return result | {"reach": {"l1": closed_loop(cell, Planning(Controller(model, planning)), folder, goals=goals)}}
+        return result | {"reach": closed_loops(cell, Planning(Controller(model, planning)), folder, goals=goals)}
     if method.kind == "zero-shot":
         model, trained = load_base(config.model, seed=cell.seed), {"trained_share": 0.0, "adapter_mb": 0.0}
     else:
@@ -62,7 +63,7 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     result["shifted"] = _relative_errors(prediction_errors(model, batches))
     if cell.shift in SHIFTS:
         result["offline"] = measure_offline(model, open_dataset(config.data).spaces.action, batches)
-    result["reach"] = {"l1": closed_loop(cell, Planning(Controller(model, planning)), folder, goals=goals)}
+    result["reach"] = closed_loops(cell, Planning(Controller(model, planning)), folder, goals=goals)
     if cell.method == "zero-shot":
         result["baselines"] = measure_baselines(cell, folder, goals)
     return result
@@ -107,21 +108,30 @@ def measure_baselines(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Return the results of policies without a model on the same goals."""
     policies: list[Policy] = [ZeroActions(), RandomActions(PLANNING.limits, cell.seed)]
     policies += [Oracle(PLANNING.limits)] if cell.shift in SHIFTS else []
-    result = {policy.name: closed_loop(cell, policy, folder, goals=goals) for policy in policies}
+    loops = {policy.name: closed_loops(cell, policy, folder, goals=goals, conditions=[SAME]) for policy in policies}
+    result = {name: by_condition[SAME] for name, by_condition in loops.items()}
     if cell.shift not in SHIFTS:
         _, expert = environments.problems(folder, cell.shift, get_goals_seed(cell), goals)
         result["oracle"] = environments.summarize(expert, expert)
     return result
 
 
-def closed_loop(cell: Cell, policy: Policy, folder: Path, *, goals: int) -> dict[str, Any]:
-    """Return the distances to the goal (cm) before the first and after each step, and the solved problems."""
+def closed_loops(
+    cell: Cell, policy: Policy, folder: Path, *, goals: int, conditions: Sequence[str] = GOALS
+) -> dict[str, dict[str, Any]]:
+    """Return the distances to the goal (cm) before the first and after each step, and the solved problems.
+
+    The results are by kind of goals (`environments.GOALS`). On the simulated arm the goal is always one image, and the
+    result has the key l1.
+    """
     seed = get_goals_seed(cell)
     if cell.shift not in SHIFTS:
         when = "before" if cell.method == BEFORE else "after"
-        return environments.closed_loop(folder, cell.shift, policy, seed=seed, goals=goals, when=when)
+        return environments.closed_loops(
+            folder, cell.shift, policy, seed=seed, goals=goals, when=when, conditions=conditions
+        )
     results = [run_task(spec, policy) for spec in _list_goals(cell.shift, seed, goals)]
-    return {"distance_cm": np.round(np.concatenate([each.distance_cm for each in results]), 3).tolist()}
+    return {SAME: {"distance_cm": np.round(np.concatenate([each.distance_cm for each in results]), 3).tolist()}}
 
 
 def _list_goals(shift: str, seed: int, goals: int) -> Iterator[BenchmarkOptions]:

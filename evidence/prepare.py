@@ -6,7 +6,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-from environments import TASKS, data_of, origin_of, record
+from environments import TASKS, data_of, record
 from methods import SHIFTS, TRAINING, Base
 
 from vjepa2_ac import encode, read_clips
@@ -79,7 +79,7 @@ def base_model(folder: Path, base: Base, seed: int, shift: str = "look") -> str:
     """Return the value of `model.base` for a base model, or for a predictor with random weights."""
     if base == "many cameras":
         return BUILTIN
-    one_camera = "base-one-camera" if shift in SHIFTS else f"base-{origin_of(shift)}"
+    one_camera = "base-one-camera" if shift in SHIFTS else f"base-{shift}"
     return str(folder / (f"scratch-{seed}" if base == "none" else one_camera))
 
 

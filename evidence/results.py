@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from environments import SAME
 from methods import METHODS, Cell
 
 from vjepa2_ac.intervals import Estimate, estimate_share
@@ -83,8 +84,7 @@ def compact(measured: Figures) -> Figures:
 def _episodes(measured: Figures) -> Figures:
     """Return the final distances of closed-loop episodes, and which of them were solved."""
     stored: Figures = {"ends_cm": [distances[-1] for distances in measured["distance_cm"]]}
-    if "visited" in measured:
-        stored["visited"] = measured["visited"]
+    stored |= {key: measured[key] for key in ("visited", "versions") if key in measured}
     if "solved" in measured:
         stored["solved"] = [int(flag) for flag in measured["solved"]]
     if "hand_cm" in measured:
@@ -127,15 +127,15 @@ def select_policy(results: Sequence[Figures], base: str, name: str, shift: str =
     return [{"reach": {"l1": result["baselines"][name]}} for result in zero_shot if "baselines" in result]
 
 
-def list_reached(result: Figures) -> list[bool]:
-    """Return which goals were reached; in third-party environments, which problems were solved."""
-    episodes = result["reach"]["l1"]
+def list_reached(result: Figures, goals: str = SAME) -> list[bool]:
+    """Return which goals were reached; in third-party environments, which problems were solved with a kind of goals."""
+    episodes = result["reach"][goals]
     if "solved" in episodes:
         return [bool(flag) for flag in episodes["solved"]]
     return [end < REACHED_CM for end in episodes["ends_cm"]]
 
 
-def estimate_success(results: Sequence[Figures]) -> Estimate:
+def estimate_success(results: Sequence[Figures], goals: str = SAME) -> Estimate:
     """Return the share of all goals that were reached, with Wilson's interval."""
-    flags = [flag for result in results for flag in list_reached(result)]
+    flags = [flag for result in results for flag in list_reached(result, goals)]
     return estimate_share(sum(flags), len(flags))

@@ -8,7 +8,7 @@ from pathlib import Path
 from textwrap import fill
 
 import numpy as np
-from environments import TASKS
+from environments import GOALS, OTHER, SAME, TASKS
 from methods import AXES, BASES, BEFORE, BEST, FROM_PRIOR, IN_EVERY_ENVIRONMENT, LONGER, METHODS, SHIFTS
 from offline import correlations
 from results import (
@@ -27,12 +27,16 @@ from scipy.stats import binomtest, spearmanr, ttest_rel
 from vjepa2_ac.intervals import estimate_mean, estimate_share
 
 FEWEST = 20  # cells of a correlation
+NOT_MEASURED = "not measured | "  # two cells of a table
 MIN_SEEDS = 3  # smallest number of seeds for a test over seeds
 MIN_CHOICES = 5  # smallest number of choices for the table of choices
 SHORT = ("zero-shot", AXES, BEST, LONGER, "full", "scratch", "scratch, 3x steps")  # rows of the short table
 Correlated = dict[str, tuple[int, dict[str, dict[str, float]]]]  # by change: number of cells, and an interval by name
-SHOWN_TASKS = {"Lift": "Lift", "LIBERO-object": "LIBERO-Spatial, objects changed"}
-"""The tasks in which methods differ, and their titles. The page has one sentence about the others."""
+TASK_TITLES = {
+    "Lift": "Lift (robosuite 1.5.2 with MuJoCo 3.9.0)",
+    "LIBERO-object": "LIBERO-Spatial, objects changed (LIBERO-PRO 0.1.1 with MuJoCo 3.17.0)",
+}
+GOAL_TITLES = {SAME: "frames of the problem's solution", OTHER: "frames of another demonstration"}
 MARKS = {
     name: f"{name}, made by `make evidence`"
     for name in ("success", "difference", "metrics", "choice", "adapters", "environments")
@@ -60,6 +64,8 @@ NOTES = """- *rollout error*: L1 error relative to persistence, on held-out epis
 - *success rate*: over all goals, with Wilson's interval, then the number of goals reached with each seed. Each seed has
   its own demonstrations, training and goals; the interval does not include the variation between seeds. In third-party
   environments: problems solved. *hand arrived*: the hand ends within 5 cm of the expert's hand.
+- Third-party environments: Lift is from robosuite 1.5.2 with MuJoCo 3.9.0, LIBERO-object from LIBERO-PRO 0.1.1 with
+  MuJoCo 3.17.0. Without a remark the goals are frames of the problem's solution, with a goal for each model step.
 - Measured at commit 0d046757 or earlier and not repeated: *calibrated axes*, *features of block 3 of 4*, *rollout
   of*, *projections only*, *DoRA*, *Action Score*."""
 
@@ -95,7 +101,7 @@ def summary(results: Sequence[Figures]) -> str:
     """Return a table for each domain shift: the success rate of each method and base model, with Wilson's interval."""
     parts = []
     for shift in SHIFTS:
-        columns = [(base, shift) for base in BASES]
+        columns = [(base, shift, SAME) for base in BASES]
         heads = [BASE_MODELS[base] for base in BASES]
         count = sum(len(list_reached(result)) for result in select_main_cells(results, BASES[0], BEST, shift))
         parts.append(f"**{_titled(CHANGES[shift])}** ({count} goals)\n\n{_rates(results, SHORT, columns, heads)}")
@@ -103,34 +109,48 @@ def summary(results: Sequence[Figures]) -> str:
 
 
 def summary_of_tasks(results: Sequence[Figures]) -> str:
-    """Return the success rate of each method on tasks of third-party environments, with Wilson's interval."""
-    tasks = [task for task in SHOWN_TASKS if select_results(results, shift=task, method=BEST)]
-    goals = [
-        sum(len(list_reached(result)) for result in select_main_cells(results, BASES[0], BEST, task)) for task in tasks
-    ]
-    heads = [f"{SHOWN_TASKS[task]}, {count} problems" for task, count in zip(tasks, goals, strict=True)]
-    columns = [(BASES[0], task) for task in tasks]
-    return _rates(results, (BEFORE, *IN_EVERY_ENVIRONMENT, FROM_PRIOR), columns, heads) if tasks else ""
+    """Return a table for each task of a third-party environment: success rates by kind of goals, with intervals."""
+    parts = []
+    for task, title in TASK_TITLES.items():
+        cells = select_results(results, shift=task)
+        columns = [(BASES[0], task, goals) for goals in GOALS if _with_goals(cells, goals)]
+        heads = [GOAL_TITLES.get(goals, goals) for *_, goals in columns]
+        count = sum(len(list_reached(result)) for result in select_main_cells(results, BASES[0], BEST, task))
+        if count:
+            table = _rates(results, (BEFORE, *IN_EVERY_ENVIRONMENT, FROM_PRIOR), columns, heads)
+            parts.append(f"**{title}**, {count} problems\n\n{table}")
+    return "\n\n".join(parts)
+
+
+def _with_goals(results: Sequence[Figures], goals: str) -> list[Figures]:
+    """Return the results that were measured with a kind of goals."""
+    return [result for result in results if goals in result["reach"]]
 
 
 def _rates(
-    results: Sequence[Figures], methods: Sequence[str], columns: Sequence[tuple[str, str]], heads: Sequence[str]
+    results: Sequence[Figures], methods: Sequence[str], columns: Sequence[tuple[str, str, str]], heads: Sequence[str]
 ) -> str:
-    """Return a table with a row for each method, and a success rate and its interval for each base model and shift."""
+    """Return a table with a row for each method, and a success rate and its interval for each column.
+
+    A column is a base model, a domain shift and a kind of goals.
+    """
     rows = ["| Method | " + " | ".join(f"{head} | 95 % interval" for head in heads) + " |"]
     rows.append("|---" * (2 * len(heads) + 1) + "|")
     for method in methods:
-        cells = [select_main_cells(results, base, method, shift) for base, shift in columns]
-        if any(cells):
-            rows.append(f"| {describe_method(method)} | {' | '.join(map(_share, cells))} |")
+        shares = [
+            _share(_with_goals(select_main_cells(results, base, method, shift), goals), goals)
+            for base, shift, goals in columns
+        ]
+        if any(share != NOT_MEASURED for share in shares):
+            rows.append(f"| {describe_method(method)} | {' | '.join(shares)} |")
     return "\n".join(rows)
 
 
-def _share(cells: Sequence[Figures]) -> str:
+def _share(cells: Sequence[Figures], goals: str) -> str:
     """Return a success rate and its interval, as two cells of a table."""
     if not cells:
-        return "not measured | "
-    share = estimate_success(cells)
+        return NOT_MEASURED
+    share = estimate_success(cells, goals)
     return f"{100 * share.value:.0f} % | {100 * share.low:.0f} to {100 * share.high:.0f} %"
 
 
@@ -146,7 +166,7 @@ def _rows(results: Sequence[Figures]) -> Iterator[str]:
             for method in METHODS:
                 for count in counts:
                     cells = select_results(results, shift=shift, base=base, method=method, episodes=count)
-                    rows.append(_row(describe_method(method), str(count or ""), cells))
+                    rows += _rows_of_goals(describe_method(method), str(count or ""), cells)
             if any(rows):
                 title = f"### {_titled(CHANGES.get(shift, shift))}, {BASE_MODELS[base]}"
                 rule = "|" + "---|" * (HEAD.count("|") + 1)
@@ -157,7 +177,15 @@ def _titled(words: str) -> str:
     return words[0].upper() + words[1:]
 
 
-def _row(name: str, demonstrations: str, cells: Sequence[Figures]) -> str:
+def _rows_of_goals(name: str, demonstrations: str, cells: Sequence[Figures]) -> list[str]:
+    """Return a row for each kind of goals with which cells were measured."""
+    return [
+        _row(name if goals == SAME else f"{name}; goals: {goals}", demonstrations, _with_goals(cells, goals), goals)
+        for goals in GOALS
+    ]
+
+
+def _row(name: str, demonstrations: str, cells: Sequence[Figures], goals: str = SAME) -> str:
     """Return a row, empty where there are no cells."""
     if not cells:
         return ""
@@ -173,22 +201,33 @@ def _row(name: str, demonstrations: str, cells: Sequence[Figures]) -> str:
     if cells[0].get("trained_share"):
         trained, size = f"{cells[0]['trained_share']:.1%}", f"{cells[0]['adapter_mb']:.2f}"
         minutes = f"{np.mean([result['cpu_minutes'] for result in cells]):.1f}"
-    arrived = [flag for result in cells for flag in result["reach"]["l1"].get("arrived", ())]
+    arrived = [flag for result in cells for flag in result["reach"][goals].get("arrived", ())]
     hand = f"{np.mean(arrived):.0%}" if arrived else ""
-    row = [name, demonstrations, error, wrong, _reach(cells), _distance(cells), hand, trained, size, minutes]
+    row = [
+        name,
+        demonstrations,
+        error,
+        wrong,
+        _reach(cells, goals),
+        _distance(cells, goals),
+        hand,
+        trained,
+        size,
+        minutes,
+    ]
     return f"| {' | '.join(row)} |"
 
 
-def _reach(cells: Sequence[Figures]) -> str:
+def _reach(cells: Sequence[Figures], goals: str) -> str:
     """Return the share of all goals with Wilson's interval, and how many each seed reached."""
-    by_seed = [list_reached(result) for result in cells]
+    by_seed = [list_reached(result, goals) for result in cells]
     share = estimate_share(sum(map(sum, by_seed)), sum(map(len, by_seed)))
     seeds = ", ".join(str(sum(flags)) for flags in by_seed)
     return f"{share.value:.0%} ({share.low:.0%} to {share.high:.0%}) of {sum(map(len, by_seed))}: {seeds}"
 
 
-def _distance(cells: Sequence[Figures]) -> str:
-    ends = np.array([end for result in cells for end in result["reach"]["l1"]["ends_cm"]])
+def _distance(cells: Sequence[Figures], goals: str) -> str:
+    ends = np.array([end for result in cells for end in result["reach"][goals]["ends_cm"]])
     mean = estimate_mean(ends, [str(index) for index in range(len(ends))])
     return f"{mean.value:.1f} ({mean.low:.1f} to {mean.high:.1f})" if mean.has_interval else f"{mean.value:.1f}"
 
@@ -226,8 +265,8 @@ def goal_by_goal(results: Sequence[Figures]) -> str:
 def difference_table(results: Sequence[Figures]) -> str:
     """Return the success rate of LoRA minus that of full fine-tuning, with an interval over goals."""
     rows = ["| Domain shift, base model | difference in points | 95 % interval |", "|---|---|---|"]
-    titles = CHANGES | SHOWN_TASKS
-    for shift in (*SHIFTS, *SHOWN_TASKS):
+    titles = CHANGES | TASK_TITLES
+    for shift in (*SHIFTS, *TASKS):
         for base in BASES if shift in SHIFTS else BASES[:1]:
             pairs = [pair for seed in _pairs(results, shift, base, "full") for pair in seed]
             if pairs:

@@ -1,6 +1,7 @@
 """The evidence: its page shows the stored results, and each kind of cell can be measured."""
 
 import json
+import shlex
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,10 +15,13 @@ import numpy as np
 import pytest
 import torch
 
+import fake_world
 from paths import ROOT
 from vjepa2_ac.config import ValidationConfig
 from vjepa2_ac.policies.action_prior import PriorOptions, load_prior, train_prior
+from vjepa2_ac.simulation.policies import ZeroActions
 from vjepa2_ac.simulation.record import RecordingSpec
+from vjepa2_ac.simulation.rollout import Image, Trial
 
 MODULES = tuple(sorted(path.stem for path in (ROOT / "evidence").glob("[!_]*.py")))
 
@@ -143,6 +147,54 @@ def test_experimental_condition_is_trained_and_measured(small: Any, method: str)
     if method == "zero-shot":
         distances_cm = {name: policy["ends_cm"][0] for name, policy in compact["baselines"].items()}
         assert distances_cm["oracle"] < 1 < distances_cm["zero action"]
+
+
+def test_third_party_condition_is_measured_with_three_kinds_of_goals(
+    evidence: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environments = evidence.environments
+    command = shlex.join([sys.executable, fake_world.__file__])
+    monkeypatch.setattr(environments.Task, "command", lambda *_: command)
+    monkeypatch.setattr(environments, "EPISODES_LIFT", 5)
+    monkeypatch.setitem(environments.FIRST, "after", 3)
+    environments.record(tmp_path, "Lift", "after")  # seeds 3 to 7; 3 and 6 are the expert's
+
+    class Spy(ZeroActions):
+        def __init__(self) -> None:
+            super().__init__()
+            self.trials = list[Trial]()
+
+        def reset(self, trial: Trial, goal_image: Image) -> None:  # noqa: ARG002
+            self.trials.append(trial)
+
+    spy = Spy()
+    loops = environments.closed_loops(tmp_path, "Lift", spy, seed=6, goals=2)
+    assert set(loops) == {"l1", "another demonstration", "one image"}
+    assert all(len(loop["solved"]) == 2 for loop in loops.values())
+    assert loops["one image"]["versions"] == {"mujoco": "3.0"}
+    same, other, one_image = spy.trials[0], spy.trials[2], spy.trials[4]
+    assert [trial.seed for trial in spy.trials] == [6, 7] * 3
+    assert [goal.gripper for goal in one_image.goals] == ["rounded"]
+    np.testing.assert_array_equal(one_image.goals[0].image, same.goals[-1].image)
+    demonstration = np.load(tmp_path / "data-Lift-after" / "Come_000006.npz")["frames"]
+    assert len(other.goals) == len(demonstration[2::2])
+    for goal, frame in zip(other.goals, demonstration[2::2], strict=True):
+        np.testing.assert_array_equal(goal.image, frame)
+    candidates = [np.load(tmp_path / "data-Lift-after" / f"Come_{seed:06d}.npz")["frames"] for seed in (3, 6)]
+    assert any(np.array_equal(spy.trials[3].goals[-1].image, frames[::2][-1]) for frames in candidates)
+
+
+def test_table_of_tasks_has_a_column_for_each_measured_kind_of_goals(evidence: Any) -> None:
+    cell = {"shift": "Lift", "base": "one camera", "method": evidence.methods.BEST, "episodes": 20, "seed": 0}
+    loops = {"l1": [1, 1, 1, 0], "another demonstration": [1, 0, 0, 0]}
+    reach = {goals: {"ends_cm": [1.0] * 4, "solved": solved} for goals, solved in loops.items()}
+    zero_shot = cell | {"method": "zero-shot", "episodes": 0}
+    results = [{"cell": cell, "reach": reach}, {"cell": zero_shot, "reach": {"l1": reach["l1"]}}]
+    rows = evidence.tables.summary_of_tasks(results).splitlines()
+    assert "(robosuite 1.5.2 with MuJoCo 3.9.0)**, 4 problems" in rows[0]
+    assert rows[2].count("95 % interval") == 2
+    assert rows[4] == "| base model | 75 % | 30 to 95 % | not measured |  |"
+    assert rows[5].startswith("| LoRA, rank 32 + projections | 75 % | 30 to 95 % | 25 % | 5 to 70 % |")
 
 
 def test_runs_of_the_selection_study_differ_and_the_plots_are_drawn(evidence: Any, stored: Any, tmp_path: Path) -> None:
