@@ -122,7 +122,7 @@ def make_table(folder: Path) -> str:
     rows = [f"| {HEAD} |", "|---" * (HEAD.count("|") + 1) + "|"]
     for path in sorted(folder.glob("*, replayed in *.npz")):
         name, _, here = path.stem.partition(", replayed in ")
-        task, _, there = name.partition(" in ")
+        task, _, recorder = name.partition(" in ")
         recorded, replayed = np.load(folder / f"{name}.npz"), np.load(path)
         moved_mm = [1000 * np.linalg.norm(replayed[key] - recorded[key], axis=-1) for key in ("start_m", "end_m")]
         levels = np.abs(replayed["frame"].astype(float) - recorded["frame"])
@@ -130,7 +130,7 @@ def make_table(folder: Path) -> str:
         solved = [f"{values['solved'].sum()} of {len(values['solved'])}" for values in (recorded, replayed)]
         spread = [f"{each.mean():.1f} (at most {each.max():.1f})" for each in moved_mm]
         frame = f"{levels.mean():.2f} | {differs.mean():.1f} %"
-        rows.append(f"| {' | '.join([task, there, here, *solved, *spread, frame])} |")
+        rows.append(f"| {' | '.join([task, recorder, here, *solved, *spread, frame])} |")
     return "\n".join(rows)
 
 

@@ -238,13 +238,13 @@ class WorldManifest(_Settings):
     def describe_versions(self, about: EnvironmentInfo) -> list[str]:
         """Return a line for each difference between the versions of an environment and those of the manifest."""
         names = sorted(self.world_versions.keys() | about.versions.keys())
-        here_and_there = {"environment": (about.world, self.world)} | {
+        pairs = {"environment": (about.world, self.world)} | {
             name: (about.versions.get(name, ""), self.world_versions.get(name, "")) for name in names
         }
         return [
-            f"{name}: {here or 'version not reported'}, in the manifest {there or 'not reported'}"
-            for name, (here, there) in here_and_there.items()
-            if here != there
+            f"{name}: {reported or 'version not reported'}, in the manifest {expected or 'not reported'}"
+            for name, (reported, expected) in pairs.items()
+            if reported != expected
         ]
 
     def describe_starts(self, expert: ClosedLoopResult) -> list[str]:
@@ -254,9 +254,9 @@ class WorldManifest(_Settings):
             if problem.seed not in here:
                 lines.append(f"problem {problem.seed}: left out, because the expert does not solve it")
                 continue
-            start, other = here[problem.seed], problem
-            hand_m = float(np.linalg.norm(np.subtract(start.start[:3], other.start[:3])))
-            object_m = abs(start.distance_m - other.distance_m)
+            start = here[problem.seed]
+            hand_m = float(np.linalg.norm(np.subtract(start.start[:3], problem.start[:3])))
+            object_m = abs(start.distance_m - problem.distance_m)
             if max(hand_m, object_m) > _SAME_M:
                 moved = f"the hand {100 * hand_m:.1f} cm, the object's distance {100 * object_m:.1f} cm"
                 lines.append(f"problem {problem.seed}: another start than in the manifest ({moved})")
