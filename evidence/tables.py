@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
 
@@ -333,10 +333,23 @@ def choice_table(results: Sequence[Figures]) -> str:
     if len(models_of_choices) < MIN_CHOICES:
         return ""
     rates = [[float(np.mean(list_reached(model))) for model in models] for models in models_of_choices]
+    metrics = {
+        title: [[_offline_row(model)[name] for model in models] for models in models_of_choices]
+        for name, title in OFFLINE.items()
+    }
+    return rate_choices(metrics, rates)
+
+
+def rate_choices(metrics: Mapping[str, Sequence[Sequence[float]]], rates: Sequence[Sequence[float]]) -> str:
+    """Return rank correlation and regret of each metric, over choices between several models.
+
+    Args:
+        metrics: Values by metric, choice and model; lower is better.
+        rates: Success rates by choice and model.
+    """
     rows = []
-    for name, title in OFFLINE.items():
-        metric = [[_offline_row(model)[name] for model in models] for models in models_of_choices]
-        pairs = list(zip(metric, rates, strict=True))
+    for title, values_of_choices in metrics.items():
+        pairs = list(zip(values_of_choices, rates, strict=True))
         correlation = [-spearmanr(values, rate).statistic for values, rate in pairs if len(set(rate)) > 1]
         regret = [100 * (max(rate) - rate[int(np.argmin(values))]) for values, rate in pairs]
         rows.append(f"| {title} | {_mean_cells(correlation, '.2f')} | {_mean_cells(regret, '.1f')} |")
