@@ -26,6 +26,7 @@ from vjepa2_ac.training.loop import train
 
 BUILTIN = "builtin:sim-tiny"
 EPISODES_A, EPISODES_SHIFTED = 400, 100
+BASE_EPISODES, BASE_SEED = 800, 3  # the training data of the base model, as in the comment of configs/demo_base.yaml
 SEED_A, SEED_SHIFTED = 11, 21  # seeds of recordings, which differ from those of the demo and its base model
 TRAINING_OPTIONS = (
     "training.steps=4000", "training.learning_rate=4e-3", "training.warmup_steps=50", "training.allow_weak_base=true",
@@ -57,8 +58,7 @@ def prepare_base_data(folder: Path, workers: int) -> None:
     """Record and encode the training data of the built-in base model, if missing."""
     data = base_data(folder)
     if not Path(data.path).exists():
-        spec = RecordingSpec("random", seed=3)  # as in the comment of configs/demo_base.yaml
-        record_dataset(data.path, spec, episodes=800, workers=workers)
+        record_dataset(data.path, RecordingSpec("random", seed=BASE_SEED), episodes=BASE_EPISODES, workers=workers)
     cache_latents(data, BUILTIN)
 
 
