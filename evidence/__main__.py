@@ -9,14 +9,15 @@
     python evidence --study widths              # fine-tune predictors of three widths with several ranks
     python evidence --study bases               # adapt other base models, with random and pre-trained encoders
     python evidence --study variants            # compare six training losses
+    python evidence --study predecessor --goals 7    # repeat the mistakes of a public fine-tuning
 
 The methods study compares methods that adapt a base model to a changed scene. The selection study compares metrics that
 select a checkpoint. The labs study asks whether adapting helps in a new lab, and whether the advice of the tool is
 good. The rates study compares learning rates for the labs study on held-out episodes of other labs, without any goal.
 The iterations study asks how many action sequences and iterations a decision needs. The widths study asks which rank
 LoRA needs. The bases study asks whether the results depend on the base model and its encoder. The variants study
-compares training losses. A finished measurement is a JSON file in the work folder; the values that the tables need are
-written to evidence/results.
+compares training losses. The predecessor study repeats the mistakes of a public fine-tuning. A finished measurement is
+a JSON file in the work folder; the values that the tables need are written to evidence/results.
 """
 
 from __future__ import annotations
@@ -55,6 +56,8 @@ def write(folder: Path) -> None:
     import iterations_tables
     import labs
     import labs_tables
+    import predecessor
+    import predecessor_tables
     import rates
     import results
     import selection
@@ -76,6 +79,7 @@ def write(folder: Path) -> None:
         ("widths", widths.compact, widths.name_of, widths_tables.write_tables),
         ("bases", bases.compact, bases.name_of, bases_tables.write_tables),
         ("variants", variants.compact, variants.name_of, variants_tables.write_tables),
+        ("predecessor", predecessor.compact, predecessor.name_of, predecessor_tables.write_tables),
     ):
         measured = results.read_all(folder / study, stored / f"{study}.json", compact, name_of)
         if measured:
@@ -194,6 +198,15 @@ def _run_variants(options: argparse.Namespace) -> int:
     return failed + _in_processes(measure, [(cell, options.folder, options.goals) for cell in cells], options)
 
 
+def _run_predecessor(options: argparse.Namespace) -> int:
+    from predecessor import all_cells, measure, name_of, prepare
+    from results import RESULTS
+
+    cells = _missing(list(all_cells(min(options.seeds, 3))), RESULTS / "predecessor.json", name_of, options)
+    prepare(options.folder)
+    return _in_processes(measure, [(cell, options.folder, options.goals) for cell in cells], options)
+
+
 STUDIES = {
     "methods": _run_methods,
     "selection": _run_selection,
@@ -203,6 +216,7 @@ STUDIES = {
     "widths": _run_with_base_models,
     "bases": _run_with_base_models,
     "variants": _run_variants,
+    "predecessor": _run_predecessor,
 }
 
 

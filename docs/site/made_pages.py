@@ -33,6 +33,7 @@ _REFERENCE = {  # page: its description
 }
 _PROJECT = {
     "made/results": "tables that commands of the repository write",
+    "predecessor": "the first public fine-tuning of the released model, repeated in the simulator",
     "published_figures": "commands that reproduce published results",
     "IMPLEMENTATION_NOTES": "how it works, and how exactness is checked",
     "decisions": "what was decided, and why",

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from copied_sets import write_npz
@@ -76,3 +77,15 @@ def test_init_prints_the_download_of_a_missing_model(capsys: pytest.CaptureFixtu
     assert "vjepa2-ac download   # downloads the model (11.7 GB)" in printed
     assert "# full run of 200 steps; run again to resume" in printed
     assert load_config("sub/a.yaml").model.base == "checkpoints/vjepa2-ac-vitg.pt"
+
+
+def test_init_warns_about_a_data_set_with_a_wrist_camera_only(
+    working_directory: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = working_directory / "data/hand/000.npz"
+    path.parent.mkdir()
+    with np.load(working_directory / "data/my robot/v1.0/000.npz") as episode:
+        np.savez(path, states=episode["states"], wrist=episode["frames"], fps_hz=15.0)
+    main(["init", "data/hand", "--model", "builtin:sim-tiny"])
+    printed = capsys.readouterr().out.partition("$ vjepa2-ac data check")[0]
+    assert "Warning: data.camera: wrist seems to be a camera on the hand" in printed

@@ -2,7 +2,7 @@
 
 import pytest
 
-from vjepa2_ac.init.dataset_properties import make_camera_names, pick_camera
+from vjepa2_ac.init.dataset_properties import make_camera_names, make_camera_values, pick_camera
 from vjepa2_ac.init.poses import Column, find_pose
 
 JOINTS = Column(
@@ -83,3 +83,17 @@ def test_camera_names_are_short_and_distinct(features: list[str], names: list[st
     assert len(set(camera_names.values())) == len(features)
     if "-" not in features[-1]:
         assert list(camera_names.values()) == names
+
+
+@pytest.mark.parametrize(
+    ("feature", "comment"),
+    [
+        ("observation.images.front", ""),
+        ("observation.images.wrist_left", "a camera on the hand; "),
+        ("observation.images.cam1", "the name does not show the view; "),
+    ],
+)
+def test_only_camera_that_is_not_an_exterior_camera_has_a_comment(feature: str, comment: str) -> None:
+    camera, _ = make_camera_values([feature], [], "info.json")
+    assert camera.reason.startswith(comment)
+    assert bool(camera.reason) == bool(comment)

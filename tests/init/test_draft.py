@@ -164,3 +164,17 @@ def test_gpu_without_bf16_capability_gets_fp16(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _device: (7, 5))
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _device: card)
     assert detect_machine().precision == "fp16"
+
+
+@pytest.mark.parametrize("path", [None, "builtin:sim-tiny"], ids=["released", "tiny"])
+def test_wrist_camera_and_long_model_step_are_written_as_warnings(path: str | None) -> None:
+    model = choose_model(path)
+    camera = {"camera": DraftValue("wrist_left")}
+    properties = replace(PROPERTIES, config_values=camera, rate_hz=DraftValue(0.5))
+    proposal = make_draft(properties, MACHINE, model, run_dir="run")
+    assert [text.partition(":")[0] for text in proposal.warnings] == ["data.camera", "data.stride"]
+    header = proposal.to_yaml(properties, MACHINE).partition("\n\n")[0]
+    assert header.count("# Warning: data.") == 2
+    guessed = replace(properties, rate_hz=DraftValue(0.5, is_guess=True))
+    assert len(make_draft(guessed, MACHINE, model, run_dir="run").warnings) == 1, "the model step is not known"
+    assert make_draft(PROPERTIES, MACHINE, model, run_dir="run").warnings == []

@@ -14,9 +14,9 @@ from vjepa2_ac.data.windows import spread_indices
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import Transition
 from vjepa2_ac.intervals import Estimate
-from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
+from vjepa2_ac.runs.checkpoint import RunState, SelectedCheckpoint, checkpoint_name, newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
-from vjepa2_ac.runs.subject import describe_selection
+from vjepa2_ac.runs.subject import describe_selection, note_on_warmup
 from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train
 
@@ -142,3 +142,11 @@ def test_weak_effect_of_actions_is_described_by_the_action_ranking(
     monkeypatch.setattr(validation, "cost_of_actions", lambda *_: Estimate(0.012, 0.0, 0.02))
     ranking = SimpleNamespace(rank=Estimate(0.21, math.nan if math.isnan(high) else 0.17, high))
     assert words in validation.action_warning(SimpleNamespace(errors=None, ranking=ranking))
+
+
+@pytest.mark.parametrize(("step", "is_noted"), [(0, False), (223, True), (250, False)])
+def test_checkpoint_within_the_warm_up_has_a_note(make_config, step: int, *, is_noted: bool) -> None:
+    config = make_config(training__steps=2_000, training__warmup_steps=250)
+    selected = SelectedCheckpoint(Path(checkpoint_name(step)), "", "newest", RunState(step=step))
+    note = note_on_warmup(config, selected)
+    assert note.startswith("The checkpoint of step 223 is within the warm-up (250 steps)") == is_noted == bool(note)

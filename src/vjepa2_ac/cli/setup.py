@@ -118,7 +118,7 @@ def _init(options: argparse.Namespace) -> int:
     guessed = [
         f"  GUESSED  {key} = {value_and_reason}" for key, value_and_reason in list_guesses(draft.config_values).items()
     ]
-    cli.show(*draft.costs, f"Written: {out}", *guessed)
+    cli.show(*draft.costs, f"Written: {out}", *guessed, *(f"Warning: {text}." for text in draft.warnings))
     status = 0 if is_missing else _check(draft, out)
     if status:
         check, train = shell_command("data", "check", out), shell_command("train", out, "--check")

@@ -10,6 +10,7 @@ from typing import Literal
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft_values import DraftValue, DraftValues
+from vjepa2_ac.training.config_warnings import is_wrist_camera
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,6 @@ def make_idle_section(*, has_velocities: bool) -> DraftValues:
 
 # ---- selection of a camera by its name ----
 
-_WRIST = re.compile(r"wrist|hand|eih|gripper", re.I)
 _EXTERIOR = re.compile(r"ext|front|side|third|agent|base|scene|top|over|left|image_0|primary", re.I)
 _NON_CAMERA = re.compile(r"depth|disparity|segment|mask|gelsight|tactile", re.I)
 
@@ -53,7 +53,7 @@ def is_not_camera(feature: str) -> bool:
 
 def pick_camera(cameras: Sequence[str]) -> str:
     """Return an exterior camera if there is one, because the released model was trained on exterior cameras."""
-    exterior = [name for name in cameras if not _WRIST.search(name)]
+    exterior = [name for name in cameras if not is_wrist_camera(name)]
     return next((name for name in exterior if _EXTERIOR.search(name)), (exterior or list(cameras))[0])
 
 
@@ -70,9 +70,17 @@ def make_camera_values(
         raise InputError(where=where, found=problem, needed="videos, or one image of the robot per step")
     names = make_camera_names(features)
     reason = f"cameras: {', '.join(names.values())}; the released model was trained on DROID's camera exterior_1_left"
-    is_guess = len(names) > 1
-    camera = DraftValue(names[pick_camera(features)], reason if is_guess else "", is_guess)
+    selected, is_guess = pick_camera(features), len(names) > 1
+    if not is_guess:
+        reason = "" if _EXTERIOR.search(selected) and not is_wrist_camera(selected) else _describe_view(selected)
+    camera = DraftValue(names[selected], reason, is_guess)
     return camera, DraftValue({name: feature for feature, name in names.items()})
+
+
+def _describe_view(camera: str) -> str:
+    """Return the comment for a data set whose only camera is not recognised as an exterior camera."""
+    view = "a camera on the hand" if is_wrist_camera(camera) else "the name does not show the view"
+    return f"{view}; the released model was trained on an exterior camera"
 
 
 def make_camera_names(features: Sequence[str]) -> dict[str, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +20,7 @@ from vjepa2_ac.intervals import MIN_EPISODES
 from vjepa2_ac.model.checkpoints import base_sizes
 from vjepa2_ac.model.model_files import OFFICIAL, PUBLISHED
 from vjepa2_ac.storage.paths import BUILTIN
+from vjepa2_ac.training.config_warnings import list_config_warnings
 from vjepa2_ac.training.cost import GIGABYTE, USUAL_GPU, estimate_memory
 
 RELEASED = "checkpoints/vjepa2-ac-vitg.pt"
@@ -136,6 +137,7 @@ class Draft:
     config_values: DraftValues
     config: Config
     costs: list[str]  # lines of text: memory and disk space
+    warnings: list[str] = field(default_factory=list)  # sentences; see `training.config_warnings`
 
     def to_yaml(self, data: DatasetProperties, machine: Machine) -> str:
         """Return the config as commented YAML."""
@@ -143,6 +145,7 @@ class Draft:
             f"Written by `vjepa2-ac init` for {data.path}: {'; '.join(data.descriptions)}.",
             f"Machine: {machine.description}.",
             *self.costs,
+            *(f"Warning: {text}." for text in self.warnings),
             "All other config keys keep their defaults: `vjepa2-ac config show CONFIG` prints every value, and",
             "`vjepa2-ac config schema` describes every key. docs/training.md explains the choices for training.",
         ]
@@ -187,13 +190,15 @@ def make_draft(data: DatasetProperties, machine: Machine, model: ModelChoice, *,
         },
     }
     config = parse_config(plain_values(values), where="vjepa2-ac init")
+    # A guessed control rate gives no reliable duration of a model step.
+    warnings = list_config_warnings(config, None if data.rate_hz.is_guess else data.rate_hz.value)
     costs: list[str] = []
     if data.steps and config.data.uses_cached_latents:
         costs.append(
             f"Disk space for cached latents: at most {_format_gigabytes(data.steps * model.bytes_per_frame)} GB."
         )
     if model.is_tiny:
-        return Draft(values, config, costs)
+        return Draft(values, config, costs, warnings)
     batch, checkpointing, needed = _choose_batch(config, machine)
     verdict = "fits into" if needed <= machine.gpu_bytes else "does not fit into"
     batch_values = {
@@ -209,7 +214,7 @@ def make_draft(data: DatasetProperties, machine: Machine, model: ModelChoice, *,
     costs.insert(0, f"Estimated peak GPU memory: {needed / GIGABYTE:.1f} GB, which {verdict} {machine.memory_text}.")
     if machine.gpu is None:
         costs.append("Run `vjepa2-ac init` on the training machine to choose batch size and precision for its GPU.")
-    return Draft(values, parse_config(plain_values(values), where="vjepa2-ac init"), costs)
+    return Draft(values, parse_config(plain_values(values), where="vjepa2-ac init"), costs, warnings)
 
 
 def _format_gigabytes(size: float) -> str:

@@ -93,7 +93,7 @@ def load_subject(
     if note and is_first_process():
         logger.warning(note)
     is_base = bool(note) and describe_untrained_model(config, selected.path) == BASE_MODEL
-    warnings = (note,) if note else ()
+    warnings = tuple(filter(None, (note, note_on_warmup(config, selected))))
     return Subject(name, config, world_model.eval(), selected.path, str(selected), is_base, note, warnings)
 
 
@@ -130,6 +130,14 @@ def note_on_untrained_model(config: Config, selected: SelectedCheckpoint) -> str
     return f"The selected checkpoint is the {untrained}: {training} did not improve {measure}."
 
 
+def note_on_warmup(config: Config, selected: SelectedCheckpoint) -> str:
+    """Return a sentence if a checkpoint was saved before the learning rate reached its peak; otherwise ""."""
+    step, warmup = parse_step(selected.path.name) or 0, config.training.warmup_steps
+    if not 0 < step < warmup:
+        return ""
+    return f"The checkpoint of step {step:,} is within the warm-up ({warmup:,} steps), so training had hardly begun."
+
+
 def describe_selection(folder: Path) -> str:
     """Return which checkpoint of a run is selected, by which rule, and its action-ranking error.
 
@@ -144,7 +152,8 @@ def describe_selection(folder: Path) -> str:
         if step and state.base_ranking_error is not None:
             base = f"{describe_untrained_model(config, selected.path)} {100 * state.base_ranking_error:.1f} %, "
         lines.append(f"Action-ranking error in validation: {100 * state.best_ranking_error:.1f} % ({base}chance 50 %).")
-    return "\n".join(filter(None, (*lines, note_on_untrained_model(config, selected))))
+    notes = note_on_untrained_model(config, selected), note_on_warmup(config, selected)
+    return "\n".join(filter(None, (*lines, *notes)))
 
 
 def read_config_of_moved_run(folder: Path, overrides: Iterable[str]) -> Config:

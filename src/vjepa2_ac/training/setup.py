@@ -38,6 +38,7 @@ from vjepa2_ac.registry import TRAINING_HOOKS
 from vjepa2_ac.reporter import INDEXING, LOADING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import ADAPTER, CHECKPOINTS, RunState, newest_checkpoint, read_state_file
 from vjepa2_ac.runs.folder import CONFIG, read_run_config
+from vjepa2_ac.training.config_warnings import list_config_warnings
 from vjepa2_ac.training.cost import batch_bytes
 from vjepa2_ac.training.cuda_graph import GraphedMicroStep
 from vjepa2_ac.training.optim import make_optimizer
@@ -86,6 +87,8 @@ def set_up(
     if config.data.stride == "auto":
         world_model, calibration = TRAINING_HOOKS.find("data.stride")(config, dataset, accelerator, reporter)
         config, dataset = config.with_stride(calibration.stride), dataset.with_stride(calibration.stride)
+    for text in list_config_warnings(config, dataset.control_rate_hz):
+        reporter.note(f"Warning: {text}.")
     splits: tuple[Split, ...] = ("train", "validation", "test") if config.data.test_share else ("train", "validation")
     clip, *_ = [first_clip(dataset, split) for split in splits]  # an empty split or a broken clip raises here
     require_fitting_clips(dataset, replay_datasets)
