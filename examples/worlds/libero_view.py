@@ -28,7 +28,8 @@ def set_view(world):
     side = np.cross([0.0, 0.0, 1.0], back) / np.linalg.norm(back[:2])
     turn = Rotation.from_matrix(np.stack([side, np.cross(back, side), back], axis=1))
     model.cam_quat[camera], model.cam_fovy[camera] = turn.as_quat(scalar_first=True), 32
-    model.light_castshadow[:], model.light_type[:], model.light_active[1:] = True, 1, False
+    model.light_castshadow[:], model.light_active[1:] = True, False
+    getattr(model, "light_type" if hasattr(model, "light_type") else "light_directional")[:] = 1  # before MuJoCo 3.3.3
     model.light_dir[:], model.light_diffuse[:], model.vis.headlight.diffuse[:] = (0.15, 0.1, -1.0), 0.5, 0.25
     model.vis.quality.shadowsize, screen.vopt.sitegroup[:] = 1024, 0  # hides sites, which would cast shadows
     screen.scn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0

@@ -26,7 +26,9 @@ def set_view(sim, options, mount):
     pose = orbit * Rotation.from_quat(model.cam_quat[camera], scalar_first=True)
     pose = pose * Rotation.from_euler("x", up, degrees=True)
     model.cam_quat[camera], model.body_quat[base] = pose.as_quat(scalar_first=True), mount.as_quat(scalar_first=True)
-    model.light_castshadow[:], model.light_type[:] = True, 1  # type 1: a directional light
+    model.light_castshadow[:] = True
+    kind = "light_type" if hasattr(model, "light_type") else "light_directional"  # the name before MuJoCo 3.3.3
+    getattr(model, kind)[:] = 1  # a directional light
     model.light_dir[:], model.light_diffuse[:], model.vis.headlight.diffuse[:] = (0.15, 0.1, -1.0), 0.5, 0.3
     model.vis.quality.shadowsize = 1024
     screen = sim._render_context_offscreen
