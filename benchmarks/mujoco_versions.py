@@ -86,7 +86,12 @@ def run(world: Any, seed: int, actions: np.ndarray | None = None) -> dict[str, n
         info = world.info()
     else:
         step_inner = world.env.step
-        world.env.step = lambda action: (executed.append(np.array(action)), step_inner(action))[1]
+
+        def step_and_note(action: np.ndarray) -> Any:
+            executed.append(np.array(action))
+            return step_inner(action)
+
+        world.env.step = step_and_note
         while since <= STEPS_AFTER_SUCCESS and len(executed) < get_num_steps(world):
             *_, info = world.step(None)
             since = since + 1 if info["success"] else 0
@@ -114,7 +119,8 @@ def save(path: Path, episodes: list[dict[str, np.ndarray]]) -> None:
     padded = np.full((len(sequences), max(map(len, sequences)), *sequences[0].shape[1:]), np.nan)
     for row, sequence in zip(padded, sequences, strict=True):
         row[: len(sequence)] = sequence
-    np.savez_compressed(path, actions=padded, **values)
+    values["actions"] = padded
+    np.savez_compressed(path, **values)  # type: ignore[arg-type]  # no name is allow_pickle
 
 
 def make_table(folder: Path) -> str:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from bases import BASES, HELD_OUT, HELD_OUT_ROWS, LABS, METHODS
+from bases import BASES, HELD_OUT, HELD_OUT_ROWS, LABS, METHODS, EncoderKind
 from results import REACHED_CM, Figures
 from tables import insert_table
 
 from vjepa2_ac.intervals import estimate_share
 
 HEADS = ("rollout error", "action-ranking error", "spread of the energy", "spread of the latents", "PSNR, dB")
-Results = dict[tuple[str, int], dict[str, list[Figures]]]  # by base model and method
+Results = dict[tuple[EncoderKind, int], dict[str, list[Figures]]]  # by base model and method
 
 
 def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:

@@ -184,8 +184,8 @@ def _make_group(
         states.append(np.concatenate([true_states[:1], ran[1]]))
     failed = [False, *(is_failure(each[-1], goal) for each in states[1:])]
     actions = np.stack([POSE.compute_differences(each) for each in states])
-    tensors = (torch.from_numpy(values).float() for values in (np.stack(states), actions))
-    return encode(model, np.stack(frames), chunk=64), *tensors, torch.tensor(failed)
+    poses, differences = (torch.from_numpy(values).float() for values in (np.stack(states), actions))
+    return encode(model, np.stack(frames), chunk=64), poses, differences, torch.tensor(failed)
 
 
 def execute(arm: SimulatedArm, actions: Actions) -> tuple[Frames, States]:

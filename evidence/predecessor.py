@@ -287,7 +287,7 @@ def select_pairs(batches: list[LatentBatch]) -> list[Transition]:
     """Return the first model step of clips that are spread over all held-out clips."""
     clips = [(batch, row) for batch in batches for row in range(len(batch.starts))]
     indices = np.linspace(0, len(clips) - 1, min(PAIRS, len(clips))).astype(int)
-    return [make_transition(*clips[index], 0) for index in indices]
+    return [make_transition(batch, row, 0) for batch, row in (clips[index] for index in indices)]
 
 
 def rank_moves(model: WorldModel, batches: list[LatentBatch], space: ActionSpace) -> ActionRanking:

@@ -219,9 +219,11 @@ def draw_clips(recordings: Recordings, rng: np.random.Generator) -> LatentBatch:
 
 def join_clips(clips: Sequence[LatentBatch]) -> LatentBatch:
     """Return clips as one batch."""
-    tensors = (torch.cat([getattr(clip, name) for clip in clips]) for name in ("latents", "states", "actions"))
-    ids, starts = (tuple(getattr(clip, name)[0] for clip in clips) for name in ("episode_ids", "starts"))
-    return LatentBatch(*tensors, None, ids, starts)
+    latents, states, actions = (
+        torch.cat([getattr(clip, name) for clip in clips]) for name in ("latents", "states", "actions")
+    )
+    ids, starts = tuple(clip.episode_ids[0] for clip in clips), tuple(clip.starts[0] for clip in clips)
+    return LatentBatch(latents, states, actions, None, ids, starts)
 
 
 def draw_groups(groups: Groups, rng: np.random.Generator) -> Groups:
