@@ -27,7 +27,7 @@ def study() -> Iterator[Any]:
         patch.setattr(study, "tables", import_module("predecessor_tables"), raising=False)
         patch.setattr(study, "results", import_module("results"), raising=False)
         yield study
-    for path in (ROOT / "evidence").glob("*.py"):
+    for path in (ROOT / "evidence").glob("[!_]*.py"):
         sys.modules.pop(path.stem, None)
 
 
