@@ -1,7 +1,7 @@
-"""Read and write the results of both studies, and select and reduce them for the tables.
+"""Read and write the results of the studies, and select and reduce those of the methods study for its tables.
 
 While a study runs, every measurement is a JSON file with all numbers in the work folder. What the page needs of them is
-stored in the repository: `results/methods.json` and `results/selection.json`.
+stored in the repository, as `results/STUDY.json`.
 """
 
 from __future__ import annotations
