@@ -76,8 +76,8 @@ def write(folder: Path) -> None:
         ("labs", labs.compact, labs.name_of, labs_tables.write_tables),
         ("rates", labs.compact, rates.name_of, rates.write_tables),
         ("iterations", iterations.compact, iterations.name_of, iterations_tables.write_tables),
-        ("widths", widths.compact, widths.name_of, widths_tables.write_tables),
-        ("bases", bases.compact, bases.name_of, bases_tables.write_tables),
+        ("widths", labs.compact, widths.name_of, widths_tables.write_tables),
+        ("bases", labs.compact, bases.name_of, bases_tables.write_tables),
         ("variants", variants.compact, variants.name_of, variants_tables.write_tables),
         ("predecessor", predecessor.compact, predecessor.name_of, predecessor_tables.write_tables),
     ):

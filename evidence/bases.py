@@ -20,7 +20,7 @@ from measure import describe_software
 from methods import PLANNING
 from prepare import BASE_CONFIG, BUILTIN, base_data, cache_latents, prepare_base_data
 from pretrain_encoder import pretrain, read_frames
-from results import rounded
+from results import as_file_name
 
 from vjepa2_ac.config import Config, DecoderConfig, ModelConfig
 from vjepa2_ac.config.loading import load_config
@@ -89,7 +89,7 @@ class Cell:
     @property
     def name(self) -> str:
         """Name of its file."""
-        return f"{self.base.name}-lab-{self.lab:02d}-{self.method.replace(', ', '-').replace(' ', '-')}"
+        return f"{self.base.name}-lab-{self.lab:02d}-{as_file_name(self.method)}"
 
 
 def all_cells() -> Iterator[Cell]:
@@ -185,8 +185,3 @@ def _measure_held_out(base: BaseModel, folder: Path) -> dict[str, float]:
 def name_of(result: dict[str, Any]) -> str:
     """Return the name of the cell that a result belongs to."""
     return Cell(**result["cell"]).name
-
-
-def compact(result: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of a measurement that the tables need."""
-    return rounded(result)  # type: ignore[no-any-return]  # a mapping stays a mapping

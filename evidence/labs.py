@@ -17,7 +17,7 @@ import torch
 from measure import describe_software
 from methods import IN_OUT, PLANNING, TRAINING
 from prepare import BUILTIN, base_data, cache_latents, data_a, exclude_episodes, prepare_base_data
-from results import rounded
+from results import as_file_name, rounded
 
 from vjepa2_ac.config import AdapterConfig, Config, DataConfig, ModelConfig, ValidationConfig
 from vjepa2_ac.config.section import Component
@@ -111,7 +111,7 @@ class Cell:
     @property
     def name(self) -> str:
         """Name of its file."""
-        return f"lab-{self.lab:02d}-{self.method.replace(', ', '-').replace(' ', '-')}"
+        return f"lab-{self.lab:02d}-{as_file_name(self.method)}"
 
 
 def all_cells() -> Iterator[Cell]:

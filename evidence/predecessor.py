@@ -17,7 +17,7 @@ import torch
 from measure import describe_software
 from methods import PLANNING, TRAINING
 from prepare import BUILTIN, cache_latents, data_a, encode_clips, exclude_episodes
-from results import rounded
+from results import as_file_name, rounded
 
 from vjepa2_ac.config import AdapterConfig, Config, DataConfig, ModelConfig, ValidationConfig
 from vjepa2_ac.config.training import CheckpointConfig
@@ -124,7 +124,7 @@ class Cell:
     @property
     def name(self) -> str:
         """Name of its file."""
-        return f"{self.condition.replace(', ', '-').replace(' ', '-')}-s{self.seed}"
+        return f"{as_file_name(self.condition)}-s{self.seed}"
 
 
 def all_cells(seeds: int = 3) -> Iterator[Cell]:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from labs import BASE_PRIOR, PRETRAINED_PRIOR, PRIOR, STEPS, make_base_config, make_prior_options
 from measure import describe_software
-from results import Figures
+from results import Figures, as_file_name
 
 from vjepa2_ac.config import ValidationConfig
 from vjepa2_ac.policies.action_prior import train_prior
@@ -49,7 +49,7 @@ class Cell:
     @property
     def name(self) -> str:
         """Name of its file."""
-        return f"lab-{self.lab:03d}-{self.method.replace(', ', '-').replace(' ', '-')}-{self.rate:g}-{self.steps}"
+        return f"lab-{self.lab:03d}-{as_file_name(self.method)}-{self.rate:g}-{self.steps}"
 
 
 def all_cells() -> Iterator[Cell]:

@@ -59,6 +59,11 @@ def rounded(value: Any) -> Any:
     return [rounded(item) for item in value] if isinstance(value, list) else value
 
 
+def as_file_name(words: str) -> str:
+    """Return words without commas and spaces, for the name of a file."""
+    return words.replace(", ", "-").replace(" ", "-")
+
+
 def name_of(result: Figures) -> str:
     """Return the name of the cell that a result of the methods study belongs to."""
     return Cell(**result["cell"]).name

@@ -74,6 +74,10 @@ class _Settings:
         with translate_write_errors(f"--manifest {path}"):
             write_atomically(path, format_json(asdict(self)))
 
+    def _get_common_options(self, episodes: int, films: int) -> dict[str, Any]:
+        common = {name: getattr(self, name) for name in ("seed", "steps", "stride", "sub_goals")}
+        return common | {"episodes": episodes, "films": min(films, episodes)}
+
 
 def _get_search(subject: Subject) -> dict[str, Any]:
     planning = subject.config.planning.model_dump(mode="json")
@@ -142,12 +146,7 @@ class Manifest(_Settings):
         return BenchmarkOptions(
             task=self.task,
             domain=self.domain,
-            episodes=len(self.problems),
-            seed=self.seed,
-            steps=self.steps,
-            stride=self.stride,
-            films=min(films, len(self.problems)),
-            sub_goals=self.sub_goals,
+            **self._get_common_options(len(self.problems), films),
             problems=tuple(problem.as_problem(self.task) for problem in self.problems),
         )
 
@@ -210,12 +209,7 @@ class WorldManifest(_Settings):
     def options(self, films: int) -> BenchmarkOptions:
         """Return the problems as options of a benchmark."""
         return BenchmarkOptions(
-            episodes=len(self.problems),
-            seed=self.seed,
-            steps=self.steps,
-            stride=self.stride,
-            films=min(films, len(self.problems)),
-            sub_goals=self.sub_goals,
+            **self._get_common_options(len(self.problems), films),
             seeds=tuple(problem.seed for problem in self.problems),
         )
 
