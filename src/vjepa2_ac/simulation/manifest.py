@@ -76,7 +76,7 @@ class _Settings:
 
     def _get_common_options(self, episodes: int, films: int) -> dict[str, Any]:
         common = {name: getattr(self, name) for name in ("seed", "steps", "stride", "sub_goals")}
-        return common | {"episodes": episodes, "films": min(films, episodes)}
+        return dict(common, episodes=episodes, films=min(films, episodes))
 
 
 def _get_search(subject: Subject) -> dict[str, Any]:
