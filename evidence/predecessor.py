@@ -8,7 +8,7 @@ the warm-up, and without validation. Its frame rate may have differed from the b
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ from vjepa2_ac.model.checkpoints import load_base
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.reporter import Reporter
-from vjepa2_ac.runs.checkpoint import NEWEST, RunState
+from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions, Planning, run_task
 from vjepa2_ac.simulation.domains import DOMAIN_B
@@ -246,21 +246,17 @@ def list_init_warnings(condition: Condition) -> list[str]:
 
 
 def compare_validations(validations: dict[int, Validation]) -> dict[str, Any]:
-    """Return the action-ranking errors of a run, their differences from the base model, and what two rules select.
-
-    The rule of `checkpoint.keep_best: ranking` is applied to all validations, also if the run did not use it.
-    """
-    base, state, rows = validations[0].ranking, RunState(step=0), list[dict[str, Any]]()
+    """Return the rollout errors and action-ranking errors of a run, and their differences from the base model."""
+    base, rows = validations[0].ranking, list[dict[str, Any]]()
     assert base is not None, "ranking_clips"
     for step, validation in sorted(validations.items()):
         assert validation.ranking is not None, "ranking_clips"
         error = over_persistence(validation.errors, "rollout")[-1].value
-        state = replace(state, step=step).with_validation(error, validation.ranking.rank.value)
         row = {"step": step, "rollout_error": error, "ranking": _interval(validation.ranking.rank)}
         if step:
             row["difference"] = _interval(rank_difference(validation.ranking, base))
         rows.append(row)
-    return {"validations": rows, "selected": state.best_step}
+    return {"validations": rows}
 
 
 @torch.no_grad()

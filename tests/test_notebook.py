@@ -13,7 +13,7 @@ from paths import ROOT
 NOTEBOOK = ROOT / "examples/first_hour.ipynb"
 LINE = 'MODEL = "builtin:sim-tiny"'
 OTHER = 'MODEL = "checkpoints/vjepa2-ac-vitg.pt"'
-UNTRAINED = "The selected checkpoint is the base model: fine-tuning did not improve action ranking."
+UNTRAINED = "The selected checkpoint is the base model: fine-tuning is not shown to improve action ranking."
 SHORTER = {
     "steps=33, seed=4), episodes=12": "steps=17, seed=4), episodes=12",
     '"steps": 40': '"steps": 4',

@@ -52,7 +52,7 @@ def test_each_mistake_of_the_predecessor_causes_its_warning(
     assert [study.tables.describe_topic(warning) for warning in by_init] == topics[:1] * ("camera" in topics)
 
 
-def test_base_model_is_selected_unless_the_whole_interval_of_a_difference_is_below_zero(study: Any) -> None:
+def test_validations_are_compared_with_the_base_model_and_selected_as_by_keep_best(study: Any) -> None:
     episodes = tuple(f"episode {index}" for index in range(10))
 
     def validation(ranks: np.ndarray, error: float) -> SimpleNamespace:
@@ -62,16 +62,16 @@ def test_base_model_is_selected_unless_the_whole_interval_of_a_difference_is_bel
         return SimpleNamespace(errors=PredictionErrors(episodes, arrays), ranking=ranking)
 
     base = np.linspace(0.3, 0.5, 10)
-    noisy = base + np.tile([0.1, -0.14], 5)  # 2 points better on average, and not certainly
-    measured = {0: validation(base, 1.0), 20: validation(noisy, 0.9), 40: validation(base - 0.01, 0.8)}
-    result = study.compare_validations(measured)
-    assert result["selected"] == 20
-    rows = result["validations"]
-    assert [study.tables.is_certainly_better(row) for row in rows[1:]] == [False, True]
+    at_chance = base + np.tile([0.3, -0.34], 5)  # 2 points better on average; the interval contains 50 %
+    measured = {0: validation(base, 1.0), 20: validation(at_chance, 0.9), 40: validation(base - 0.01, 0.8)}
+    rows = study.compare_validations(measured)["validations"]
     assert [row["rollout_error"] for row in rows] == [1.0, 0.9, 0.8]
     assert rows[2]["difference"] == pytest.approx([-0.01] * 3)
-    worse = study.compare_validations({0: validation(base, 1.0), 20: validation(base + 0.1, 0.1)})
-    assert worse["selected"] == 0
+    assert study.tables.select_step(rows) == 40
+    assert study.tables.select_step(rows, is_former_rule=True) == 20
+    assert study.tables.select_step(rows[:2]) == 0
+    worse = study.compare_validations({0: validation(base, 1.0), 20: validation(base + 0.1, 0.1)})["validations"]
+    assert study.tables.select_step(worse) == 0
 
 
 def test_tables_of_the_predecessor_page_equal_the_stored_results(study: Any) -> None:

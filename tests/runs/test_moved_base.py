@@ -133,7 +133,7 @@ def test_resume_with_a_moved_base_model_stores_the_new_path(
     assert main(["train", str(run), "--resume", "run_dir=elsewhere"]) == 2
 
 
-SELECTED = "The selected checkpoint is the base model: fine-tuning did not improve action ranking."
+SELECTED = "The selected checkpoint is the base model: fine-tuning is not shown to improve action ranking."
 SCRATCH = {"model__base": "random", "model__sizes": TINY_CONFIG, "adapter__kind": "none"}
 FEW = EvaluationOptions(clips=3, probes=ProbeOptions(ranking_clips=0, examples=0))
 
@@ -163,7 +163,7 @@ def base_run(make_config: MakeConfig) -> Path:
         (SCRATCH, {}, "0", "Checkpoint 0 is the untrained model."),
         (
             SCRATCH, {}, "selected",
-            "The selected checkpoint is the untrained model: training did not improve action ranking.",
+            "The selected checkpoint is the untrained model: training is not shown to improve action ranking.",
         ),
         (
             {"adapter__modules_to_save": ["action_encoder", "state_encoder"]}, {"widths": Widths(9, 9)}, "selected",

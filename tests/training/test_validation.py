@@ -29,14 +29,19 @@ def validations(folder: Path) -> list[dict[str, Any]]:
 
 @pytest.fixture
 def set_validation_errors(monkeypatch):
-    """Return a function that sets the (rollout error, ranking error) of validations, the base model's first."""
+    """Return a function that sets the (rollout error, ranking error) of validations, the base model's first.
 
-    def use(*errors: tuple[float, float]) -> None:
+    The interval of each ranking error ends at `error + half_width`; NaN: there is no interval.
+    """
+
+    def use(*errors: tuple[float, float], half_width: float = math.nan) -> None:
         values = iter(errors)
 
         def metrics(_: object) -> dict[str, float]:
             error, rank = next(values)
-            return {validation.SELECTION_ERROR: error, validation.RANKING_ERROR: rank}
+            key = validation.RANKING_ERROR
+            interval = {key: rank, f"{key}_low": rank - half_width, f"{key}_high": rank + half_width}
+            return {validation.SELECTION_ERROR: error, **interval}
 
         monkeypatch.setattr(validation, "validation_metrics", metrics)
 
@@ -93,6 +98,36 @@ def test_lowest_ranking_error_is_selected_while_the_rollout_error_decreases(
         "Selected checkpoint: step 1, the best by action ranking.\n"
         "Action-ranking error in validation: 5.0 % (base model 10.0 %, chance 50 %)."
     )
+
+
+@pytest.mark.parametrize(
+    ("errors", "half_width", "selected"),
+    [
+        ([(0.9, 0.51), (0.5, 0.44), (0.4, 0.41)], 0.1, 0),
+        ([(0.9, 0.51), (0.5, 0.44), (0.4, 0.45)], 0.055, 1),
+        ([(0.9, 0.51), (0.5, 0.44), (0.4, 0.41)], math.nan, 2),
+        ([(0.9, 0.51), (0.5, 0.52), (0.4, 0.53)], math.nan, 0),
+        ([(0.9, 0.55), (0.5, 0.53), (0.4, 0.40)], 0.05, 2),
+    ],
+)
+def test_fine_tuned_checkpoint_is_selected_only_if_it_is_shown_to_rank_actions_better_than_chance(
+    make_config, reporter, set_validation_errors, errors, half_width, selected
+) -> None:
+    set_validation_errors(*errors, half_width=half_width)
+    folder = train(make_config(**{**EVERY_STEP, "training__steps": 2}), reporter)
+    assert read_state(newest_checkpoint(folder / "checkpoints")).best_step == selected
+    note = "The selected checkpoint is the base model: fine-tuning is not shown to improve action ranking."
+    assert (note in describe_selection(folder)) == (selected == 0)
+
+
+def test_predictor_with_random_weights_is_selected_even_if_it_ranks_actions_at_chance(
+    make_config, reporter, set_validation_errors
+) -> None:
+    set_validation_errors((0.9, 0.51), (0.5, 0.49), half_width=0.1)
+    sizes = {"encoder": {"width": 24, "depth": 1, "heads": 2}, "predictor": {"width": 24, "depth": 1, "heads": 2}}
+    model = {"model__base": "random", "model__sizes": {"image_size": 32, **sizes}, "adapter__kind": "none"}
+    folder = train(make_config(**{**EVERY_STEP, "training__steps": 1}, **model), reporter)
+    assert read_state(newest_checkpoint(folder / "checkpoints")).best_step == 1
 
 
 def test_resume_after_saving_the_base_is_exact(make_config, reporter, tmp_path, monkeypatch) -> None:

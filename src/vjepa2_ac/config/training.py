@@ -125,9 +125,10 @@ class CheckpointConfig(Section):
     keep_best: Annotated[Literal["ranking", "error", "off"], OFF, Affects.MEASURED] = "ranking"
     """The criterion for the best checkpoint. The best checkpoint is saved and kept, and is the default for evaluation,
     export and planning. ranking: the lowest action-ranking error (`validation.ranking_clips`), and among those within
-    half a percentage point of it the lowest rollout error; the untrained state is a candidate, because a lower error
-    may come with worse plans. error: the rollout error relative to persistence at the last horizon. off: no best
-    checkpoint, the default is the newest."""
+    half a percentage point of it the lowest rollout error. The base model is a candidate, because a lower error may
+    come with worse plans; a later checkpoint is a candidate if the 95 % interval of its action-ranking error is below
+    chance (50 %). error: the rollout error relative to persistence at the last horizon. off: no best checkpoint, the
+    default is the newest."""
     remote: PathOrUrl | None = None
     """Where the run is copied during training: gs://bucket/folder, another writable fsspec URL, or a folder. A start
     with an empty run_dir resumes from the copy. `keep` and `keep_best` also apply to the copy. null: no copy."""

@@ -127,7 +127,7 @@ def note_on_untrained_model(config: Config, selected: SelectedCheckpoint) -> str
         return f"The selected checkpoint is the {untrained}: no later checkpoint has been validated."
     training = "training" if config.model.is_random else "fine-tuning"
     measure = "the prediction error" if state.best_ranking_error is None else "action ranking"
-    return f"The selected checkpoint is the {untrained}: {training} did not improve {measure}."
+    return f"The selected checkpoint is the {untrained}: {training} is not shown to improve {measure}."
 
 
 def note_on_warmup(config: Config, selected: SelectedCheckpoint) -> str:

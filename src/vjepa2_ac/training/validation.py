@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import islice
 from typing import Any
@@ -17,7 +17,7 @@ from vjepa2_ac.evaluation.action_use import Transition, gather_transitions, rank
 from vjepa2_ac.evaluation.measure import prediction_errors, previous_clip_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Validation, cost_of_actions, one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.summary import CHANCE, format_interval, format_percent
+from vjepa2_ac.evaluation.summary import CHANCE, format_interval, format_percent, is_better_than_chance
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState
@@ -68,7 +68,8 @@ def action_warning(validation: Validation) -> str:
 
 def base_warning(validation: Validation) -> str:
     """Return a warning if a base model is not shown to rank actions better than chance, otherwise an empty string."""
-    if (ranking := validation.ranking) is None or not ranking.rank.has_interval or ranking.rank.high < CHANCE:
+    ranking = validation.ranking
+    if ranking is None or not ranking.rank.has_interval or is_better_than_chance(ranking.rank):
         return ""
     return (
         "Warning: the base model is not shown to rank actions better than chance (action-ranking error"
@@ -92,11 +93,26 @@ def record(run: Run, validation: Validation, metrics_log: MetricsLog | None) -> 
             if image is not None:
                 metrics_log.log_image("validation", "imagined", run.state.step, image)
     criterion, before = run.config.checkpoint.keep_best, run.state
-    if criterion != "off":
-        run.state = before.with_validation(
-            metrics[SELECTION_ERROR], metrics[RANKING_ERROR] if criterion == "ranking" else None
-        )
+    if criterion == "error":
+        run.state = before.with_validation(metrics[SELECTION_ERROR])
+    elif criterion == "ranking" and _is_candidate(run, metrics):
+        run.state = before.with_validation(metrics[SELECTION_ERROR], metrics[RANKING_ERROR])
     return run.state.best_step != before.best_step
+
+
+def _is_candidate(run: Run, metrics: Mapping[str, float]) -> bool:
+    """Return whether `checkpoint.keep_best: ranking` may select the checkpoint of a validation.
+
+    A fine-tuned checkpoint must be shown to rank actions better than chance; otherwise the base model stays selected.
+    Without a base model (random weights, new input projections) every checkpoint is a candidate.
+    """
+    if run.state.step == 0 or not _has_base(run):
+        return True
+    return is_better_than_chance(Estimate(*(metrics[f"{RANKING_ERROR}{end}"] for end in ("", "_low", "_high"))))
+
+
+def _has_base(run: Run) -> bool:
+    return not run.config.model.is_random and run.world_model.new_input_projections is None
 
 
 def is_finished(config: Config, state: RunState) -> bool:
@@ -197,8 +213,7 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
         return None
     validation = validate(run, reporter)
     config, error = run.config, one_step_over_persistence(validation.errors).value
-    has_base = not config.model.is_random and run.world_model.new_input_projections is None
-    if has_base and (warning := base_warning(validation)):
+    if _has_base(run) and (warning := base_warning(validation)):
         reporter.note(warning)
     if error < 1.0 or config.training.allow_weak_base or config.model.is_random:
         return validation
