@@ -6,21 +6,19 @@ Each predictor is trained as that of the built-in base model (random encoder, se
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from labs import Cell as LabCell
-from labs import closed_loop, evaluate, get_lab, make_config, make_data_config
-from labs import prepare as prepare_lab
-from measure import describe_software
+from labs import closed_loop, evaluate, get_lab, make_config, make_data_config, prepare_lab
 from methods import PLANNING
 from prepare import BASE_CONFIG, BUILTIN, base_data, cache_latents, prepare_base_data
 from pretrain_encoder import pretrain, read_frames
 from results import as_file_name
+from work import Work
 
 from vjepa2_ac.config import Config, DecoderConfig, ModelConfig
 from vjepa2_ac.config.loading import load_config
@@ -109,9 +107,14 @@ def prepare_data(folder: Path, workers: int) -> None:
         prepare_lab(get_lab(number), folder)
 
 
-def prepare(base: BaseModel, folder: Path) -> None:
+def prepare(cells: Sequence[Cell], work: Work) -> int:
+    """Make the data and the base models of the cells; return the number of base models that failed."""
+    prepare_data(work.folder, work.workers)
+    return work.run(prepare_base, [(base, work.folder) for base in dict.fromkeys(cell.base for cell in cells)])
+
+
+def prepare_base(base: BaseModel, folder: Path) -> None:
     """Pre-train a base model on one thread, and encode all data with its encoder."""
-    torch.set_num_threads(1)
     if base.location(folder) == BUILTIN:
         return
     fresh, made = folder / f"fresh-{base.name}", Path(base.location(folder))
@@ -147,8 +150,7 @@ def make_cell_config(cell: Cell, folder: Path) -> Config:
 
 def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Train and measure a cell on one thread."""
-    torch.set_num_threads(1)
-    result: dict[str, Any] = {"cell": asdict(cell), "made_with": describe_software()}
+    result: dict[str, Any] = {}
     if cell.method == HELD_OUT:
         return result | {"rows": _measure_held_out(cell.base, folder)}
     config = make_cell_config(cell, folder)
@@ -180,8 +182,3 @@ def _measure_held_out(base: BaseModel, folder: Path) -> dict[str, float]:
     )
     rows = make_rows(evaluate_subject(location, options))
     return {f"{row.model} {row.key}": row.value for row in rows if row.key in HELD_OUT_ROWS and np.isfinite(row.value)}
-
-
-def name_of(result: dict[str, Any]) -> str:
-    """Return the name of the cell that a result belongs to."""
-    return Cell(**result["cell"]).name

@@ -12,17 +12,16 @@ of one model step per second on one core that other processes use, too.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from measure import describe_software
 from methods import SHIFTS
 from prepare import cache_latents
-from results import rounded
+from work import Work
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import load_config
@@ -123,9 +122,14 @@ def make_config(task: Task, folder: Path) -> Config:
     return load_config(f"builtin:{task.config}", overrides)
 
 
-def prepare(task: Task, folder: Path) -> None:
+def prepare(cells: Sequence[Cell], work: Work) -> int:
+    """Make the data and models of the cells' tasks; return the number of tasks that failed."""
+    tasks = [TASKS[name] for name in dict.fromkeys(cell.task for cell in cells)]
+    return work.run(prepare_task, [(task, work.folder) for task in tasks])
+
+
+def prepare_task(task: Task, folder: Path) -> None:
     """Record the demonstrations of a task, encode them, and train its model; finished parts are not repeated."""
-    torch.set_num_threads(1)
     config = make_config(task, folder)
     if not Path(config.data.path).exists():
         spec = RecordingSpec(task.domain, seed=RECORDED, task=task.recorded)
@@ -135,19 +139,17 @@ def prepare(task: Task, folder: Path) -> None:
 
 
 def measure(cell: Cell, folder: Path, problems: int) -> dict[str, Any]:
-    """Measure a cell on one thread.
+    """Measure a cell.
 
     Args:
         cell: The cell.
         folder: The work folder with the output of `prepare`.
         problems: Largest number of starts or problems.
     """
-    torch.set_num_threads(1)
     task = TASKS[cell.task]
     measure_kind = measure_decisions if cell.kind == "decisions" else measure_closed_loop
     largest = STARTS if cell.kind == "decisions" else PROBLEMS
-    result = measure_kind(task, make_controller(cell, folder), min(problems, largest))
-    return {"cell": asdict(cell), "made_with": describe_software(), **result}
+    return measure_kind(task, make_controller(cell, folder), min(problems, largest))
 
 
 def make_controller(cell: Cell, folder: Path) -> Controller:
@@ -233,11 +235,6 @@ def measure_closed_loop(task: Task, controller: Controller, problems: int) -> di
     return {"solved": result.successes.astype(int).tolist(), "distance_cm": result.distance_cm[:, -1].tolist()}
 
 
-def name_of(result: dict[str, Any]) -> str:
-    """Return the name of the cell that a result belongs to."""
-    return Cell(**result["cell"]).name
-
-
 def compact(result: dict[str, Any]) -> dict[str, Any]:
     """Return the values of a measurement that the tables need, with few digits."""
     if "searches" not in result:
@@ -248,4 +245,4 @@ def compact(result: dict[str, Any]) -> dict[str, Any]:
         for count, rows in result["searches"].items()
     }
     oracle = np.round(result["oracle"], 2).tolist()
-    return rounded(result) | {"oracle": oracle, "searches": searches}  # type: ignore[no-any-return]  # a mapping
+    return result | {"oracle": oracle, "searches": searches}

@@ -7,17 +7,17 @@ the labs adapting may be useless or harmful: low-diversity demonstrations, few d
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from measure import describe_software
 from methods import IN_OUT, PLANNING, TRAINING
 from prepare import BUILTIN, base_data, cache_latents, data_a, exclude_episodes, prepare_base_data
-from results import as_file_name, rounded
+from results import as_file_name
+from work import Work
 
 from vjepa2_ac.config import AdapterConfig, Config, DataConfig, ModelConfig, ValidationConfig
 from vjepa2_ac.config.section import Component
@@ -121,9 +121,16 @@ def all_cells() -> Iterator[Cell]:
             yield Cell(number, method)
 
 
-def prepare(lab: Lab, folder: Path) -> None:
+def prepare(cells: Sequence[Cell], work: Work) -> int:
+    """Make the data of the cells' labs; return the number of labs that failed."""
+    if any(cell.method == PRETRAINED_PRIOR for cell in cells):
+        prepare_base_prior(work.folder, work.workers)
+    numbers = dict.fromkeys(cell.lab for cell in cells)
+    return work.run(prepare_lab, [(get_lab(number), work.folder) for number in numbers])
+
+
+def prepare_lab(lab: Lab, folder: Path) -> None:
     """Record the demonstrations and the held-out episodes of a lab, and encode them."""
-    torch.set_num_threads(1)
     data = make_data_config(lab, folder)
     if not Path(data.path).exists():
         spec = RecordingSpec(lab.domain, seed=SEED + lab.number, recipe=lab.recipe)
@@ -133,7 +140,6 @@ def prepare(lab: Lab, folder: Path) -> None:
 
 def prepare_base_prior(folder: Path, workers: int = 1) -> None:
     """Record and encode the training data of the base model, and train an action prior on them, if missing."""
-    torch.set_num_threads(1)
     prepare_base_data(folder, workers)
     if not _base_prior(folder).exists():
         train_prior(make_base_config(folder), _base_prior(folder), BASE_PRIOR)
@@ -184,13 +190,8 @@ def make_config(cell: Cell, folder: Path) -> Config:
 
 def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Train and measure a cell on one thread."""
-    torch.set_num_threads(1)
     config, reach = make_config(cell, folder), closed_loop(cell, goals)
-    result: dict[str, Any] = {
-        "cell": asdict(cell),
-        "condition": get_lab(cell.lab).condition,
-        "made_with": describe_software(),
-    }
+    result: dict[str, Any] = {"condition": get_lab(cell.lab).condition}
     base = load_base(config.model, seed=config.seed).eval()
     if cell.method == "base model":
         policies = (ZeroActions(), RandomActions(PLANNING.limits, cell.lab), Oracle(PLANNING.limits))
@@ -214,16 +215,6 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
             model = load_subject(run, name).world_model
             result["closed_loop"][name] = reach(Planning(Controller(model, PLANNING)))
     return result
-
-
-def name_of(result: dict[str, Any]) -> str:
-    """Return the name of the cell that a result belongs to."""
-    return Cell(**result["cell"]).name
-
-
-def compact(result: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of a measurement that the tables need."""
-    return rounded(result)  # type: ignore[no-any-return]  # a mapping stays a mapping
 
 
 def closed_loop(cell: Cell, goals: int) -> Any:

@@ -1,21 +1,21 @@
-"""Train a cell of the methods study, and measure it on held-out episodes and in closed loop."""
+"""The methods study: train a cell, and measure it on held-out episodes and in closed loop."""
 
 from __future__ import annotations
 
-import subprocess
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, get_args
 
 import environments
+import methods
 import numpy as np
-import torch
-from environments import GOALS, SAME
-from methods import BEFORE, PLANNING, SHIFTS, Cell, get_method
+from environments import GOALS, SAME, TASKS
+from methods import BEFORE, MORE_SEEDS, PLANNING, SHIFTS, Cell, get_method
 from offline import measure_offline
-from prepare import base_model, data_before, data_shifted, encode_clips, exclude_episodes
+from prepare import base_model, data_before, data_shifted, encode_clips, exclude_episodes, prepare_shifts
+from results import compact  # noqa: F401 - a part of the study, see __main__
+from work import Work
 
 from vjepa2_ac.config import Config, ModelConfig, ValidationConfig
 from vjepa2_ac.config.section import Component
@@ -41,12 +41,26 @@ TEST_GOALS = 9_000  # first seed of problems, to which a cell adds its own (`get
 CLIPS = 128  # of held-out episodes
 
 
+def all_cells() -> list[Cell]:
+    """Return all cells but those of third-party tasks whose environment is not installed."""
+    absent = {name: task for name, task in TASKS.items() if not task.is_installed}
+    for name, task in absent.items():
+        fix = f"Run `make worlds/{task.program}` (docs/worlds.md)"
+        print(f"{name} is skipped: its environment is not installed. {fix}")
+    return [cell for cell in methods.all_cells() if cell.shift not in absent]
+
+
+def prepare(cells: Sequence[Cell], work: Work) -> int:
+    """Make the inputs of all cells; return 0 (no failure)."""
+    prepare_shifts(work.folder, {cell.shift for cell in cells}, MORE_SEEDS)
+    return 0
+
+
 def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
-    """Train a cell on one thread and return its metrics; `folder` is the work folder with the output of `prepare`."""
-    torch.set_num_threads(1)
+    """Train a cell and return its metrics; `folder` is the work folder with the output of `prepare`."""
     config, method = make_config(cell, folder), get_method(cell.method)
     started = time.process_time()
-    result: dict[str, Any] = {"cell": asdict(cell), "made_with": describe_software()}
+    result: dict[str, Any] = {}
     if method.kind == "cloned":
         prior, result["held_out"] = _prior(cell, config, folder)
         result |= {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": (time.process_time() - started) / 60}
@@ -73,13 +87,6 @@ def _prior(cell: Cell, config: Config, folder: Path) -> tuple[str, Mapping[str, 
     """Train an action prior on a cell's demonstrations; return its folder and its metrics on held-out clips."""
     path = folder / "priors" / cell.name
     return str(path), train_prior(config, path).held_out
-
-
-def describe_software() -> dict[str, str]:
-    """Return the version of PyTorch and the commit of this checkout."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=7"]
-    described = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
-    return {"torch": torch.__version__, "commit": described.stdout.strip() or "unknown"}
 
 
 def make_config(cell: Cell, folder: Path) -> Config:

@@ -152,33 +152,32 @@ class Cell:
         return words
 
 
-def all_cells(at_most: int) -> Iterator[Cell]:
-    """Yield every cell, the most important first, with at most `at_most` seeds."""
-    seeds = min(at_most, SEEDS)
+def all_cells() -> Iterator[Cell]:
+    """Yield every cell, the most important first."""
     main = ("zero-shot", BEST, "full", "scratch")
     elsewhere = {BEFORE, LONGER, FROM_PRIOR, *main}
     others = tuple(
         name for name, method in METHODS.items() if method.kind not in {"cloned", "past"} and name not in elsewhere
     )
-    for seed in range(seeds):
+    for seed in range(SEEDS):
         yield from _list_cells("look", main, 20, seed)
-    for seed in range(seeds):
+    for seed in range(SEEDS):
         yield from _list_cells("look", others, 20, seed)
-    for seed in range(seeds):
+    for seed in range(SEEDS):
         yield from _list_cells("motion", (*main, LONGER, "scratch, 3x steps"), 20, seed)
-    for seed in range(min(at_most, MORE_SEEDS)):
+    for seed in range(MORE_SEEDS):
         yield from _list_cells("randomized", ("zero-shot", BEST, "full", "scratch", "scratch, 3x steps"), 20, seed)
         yield Cell("randomized", "many cameras", LONGER, 20, seed)
-    for seed in range(seeds):
+    for seed in range(SEEDS):
         for episodes in (10, 40):
             yield from _list_cells("look", (BEST, "full", "scratch"), episodes, seed)
         yield Cell("look", "none", "scratch, 3x steps", 10, seed)  # does a base model save steps or demonstrations?
-    yield from environment_cells(at_most)
+    yield from environment_cells()
 
 
-def environment_cells(at_most: int) -> Iterator[Cell]:
+def environment_cells() -> Iterator[Cell]:
     """Yield the cells of third-party environments."""
-    for seed in range(at_most):
+    for seed in range(MORE_SEEDS):
         for name, task in TASKS.items():
             if seed == 0:
                 yield Cell(name, "one camera", BEFORE, 0, seed)

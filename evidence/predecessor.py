@@ -7,17 +7,17 @@ the warm-up, and without validation. Its frame rate may have differed from the b
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from measure import describe_software
 from methods import PLANNING, TRAINING
 from prepare import BUILTIN, cache_latents, data_a, encode_clips, exclude_episodes
-from results import as_file_name, rounded
+from results import as_file_name
+from work import Work
 
 from vjepa2_ac.config import AdapterConfig, Config, DataConfig, ModelConfig, ValidationConfig
 from vjepa2_ac.config.training import CheckpointConfig
@@ -55,7 +55,7 @@ from vjepa2_ac.training.loop import train
 EXTERIOR, WRIST = "exterior_1_left", "wrist_left"
 STRIDE, OTHER_STRIDE = 4, 8  # control steps per model step: the base model's, and twice its duration
 STEPS, WARMUP, SHORT = 400, 20, 40
-EPISODES, DEMONSTRATIONS, SEED, GOALS_SEED = 48, 20, 64, 64_000
+EPISODES, DEMONSTRATIONS, SEEDS, SEED, GOALS_SEED = 48, 20, 3, 64, 64_000
 CLIPS, PAIRS, REACH_CM, NODES = 64, 30, 15.0, 7
 """Held-out clips; pairs of frames and half-width of the landscapes, as in the predecessor's notebook; points along each
 of dx, dy and dz (the notebook has 25 points along dx and dy)."""
@@ -127,16 +127,21 @@ class Cell:
         return f"{as_file_name(self.condition)}-s{self.seed}"
 
 
-def all_cells(seeds: int = 3) -> Iterator[Cell]:
+def all_cells() -> Iterator[Cell]:
     """Yield all cells, seed by seed."""
-    for seed in range(seeds):
+    for seed in range(SEEDS):
         for name in ALL:
             yield Cell(name, seed)
 
 
-def prepare(folder: Path) -> None:
+def prepare(cells: Sequence[Cell], work: Work) -> int:  # noqa: ARG001 - as of the other studies
+    """Record the episodes with three cameras, and encode them for each view; return 0 (no failure)."""
+    prepare_views(work.folder)
+    return 0
+
+
+def prepare_views(folder: Path) -> None:
     """Record the episodes with three cameras, and encode them for each view."""
-    torch.set_num_threads(1)
     if not (folder / "data-predecessor").exists():
         spec = RecordingSpec(DOMAIN_B, seed=SEED, cameras=3)
         record_dataset(folder / "data-predecessor", spec, episodes=EPISODES)
@@ -211,9 +216,8 @@ class Recorder(Reporter):
 
 def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Train and measure a cell on one thread."""
-    torch.set_num_threads(1)
     config, condition = make_config(cell, folder), ALL[cell.condition]
-    result: dict[str, Any] = {"cell": asdict(cell), "made_with": describe_software()}
+    result: dict[str, Any] = {}
     if not condition.steps:
         model = load_base(config.model, seed=0).eval()
         if cell.seed == 0:  # the held-out clips are the same for all seeds
@@ -309,13 +313,3 @@ def _relative_energy(landscapes: Landscapes) -> float:
 
 def _interval(estimate: Estimate) -> list[float]:
     return [estimate.value, estimate.low, estimate.high]
-
-
-def name_of(result: dict[str, Any]) -> str:
-    """Return the name of the cell that a result belongs to."""
-    return Cell(**result["cell"]).name
-
-
-def compact(result: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of a measurement with the precision that the tables need."""
-    return rounded(result)  # type: ignore[no-any-return]  # a mapping stays a mapping

@@ -96,7 +96,7 @@ def prepare_world(folder: Path, task: str, reporter: Reporter = SILENT) -> None:
         export_run(train(config, reporter), base)
 
 
-def prepare(folder: Path, shifts: Collection[str], seeds: int, reporter: Reporter = SILENT) -> None:
+def prepare_shifts(folder: Path, shifts: Collection[str], seeds: int, reporter: Reporter = SILENT) -> None:
     """Make all missing inputs. For the simulated arm this takes about 25 minutes on one core."""
     folder.mkdir(parents=True, exist_ok=True)
     for seed in range(seeds):

@@ -9,16 +9,25 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import labs
 import numpy as np
-import torch
-from labs import BASE_PRIOR, PRETRAINED_PRIOR, PRIOR, STEPS, make_base_config, make_prior_options
-from measure import describe_software
+from labs import (
+    BASE_PRIOR,
+    PRETRAINED_PRIOR,
+    PRIOR,
+    STEPS,
+    get_lab,
+    make_base_config,
+    make_prior_options,
+    prepare_base_prior,
+    prepare_lab,
+)
 from results import Figures, as_file_name
+from work import Work
 
 from vjepa2_ac.config import ValidationConfig
 from vjepa2_ac.policies.action_prior import train_prior
@@ -61,10 +70,17 @@ def all_cells() -> Iterator[Cell]:
         yield Cell(0, ON_BASE_DATA, BASE_PRIOR.learning_rate, num_steps)
 
 
-def measure(cell: Cell, folder: Path) -> dict[str, Any]:
-    """Train on one thread, and return the error on held-out episodes."""
-    torch.set_num_threads(1)
-    result: dict[str, Any] = {"cell": asdict(cell), "made_with": describe_software()}
+def prepare(cells: Sequence[Cell], work: Work) -> int:
+    """Make the data of the cells' labs, and the prior of the base model's data; return the number of failed labs."""
+    if {PRETRAINED_PRIOR, ON_BASE_DATA} & {cell.method for cell in cells}:
+        prepare_base_prior(work.folder, work.workers)
+    used = [get_lab(number) for number in LAB_NUMBERS if any(cell.lab == number for cell in cells)]
+    return work.run(prepare_lab, [(lab, work.folder) for lab in used])
+
+
+def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:  # noqa: ARG001 - as of the other studies
+    """Train, and return the error on held-out episodes; there are no goals."""
+    result: dict[str, Any] = {}
     run = folder / "rate-runs" / cell.name
     if cell.method in {PRIOR, PRETRAINED_PRIOR, ON_BASE_DATA}:
         on_base = cell.method == ON_BASE_DATA
@@ -78,11 +94,6 @@ def measure(cell: Cell, folder: Path) -> dict[str, Any]:
     train(config.model_copy(update={"run_dir": str(run), "training": training, "validation": validation}), SILENT)
     *_, last = (row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] == "validation")
     return result | {"error": last["rollout_over_persistence_last"], "ranking_error": last["action_ranking_error"]}
-
-
-def name_of(result: dict[str, Any]) -> str:
-    """Return the name of the cell that a result belongs to."""
-    return Cell(**result["cell"]).name
 
 
 def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:  # noqa: ARG001 - as of the other studies

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from environments import SAME
-from methods import METHODS, Cell
+from methods import METHODS
 
 from vjepa2_ac.intervals import Estimate, estimate_share
 from vjepa2_ac.storage import write_atomically
@@ -30,17 +30,36 @@ BASE_MODELS = {
     "none": "no base model",
 }
 SHIFTED = ("one_step", "one_step_zero_actions", "one_step_shuffled_actions")
+DESCRIBED = ("cell", "made_with", "goals", "core_minutes")  # what `work.measure_cell` adds to each result
 Figures = dict[str, Any]
 
 
 def read_all(
-    folder: Path, stored: Path, compact: Callable[[Figures], Figures], name_of: Callable[[Figures], str]
+    folder: Path, stored: Path, compact: Callable[[Figures], Figures], make_cell: Callable[..., Any]
 ) -> list[Figures]:
-    """Return the results of a work folder, and the stored results that it lacks, ordered by name."""
+    """Return the results of a work folder, and the stored results that it lacks, ordered by name.
+
+    Args:
+        folder: The work folder of a study, with a file for each cell.
+        stored: The stored results.
+        compact: Returns the values that the tables need.
+        make_cell: Returns a cell, which has a name, from the field `cell` of a result.
+    """
     previous = json.loads(stored.read_text()) if stored.exists() else []
-    measured = [compact(json.loads(path.read_text())) for path in folder.glob("*.json")]
-    by_name = {name_of(result): result for result in (*previous, *measured)}
+    measured = [_reduce(json.loads(path.read_text()), compact) for path in folder.glob("*.json")]
+    by_name = {make_cell(**result["cell"]).name: result for result in (*previous, *measured)}
     return [by_name[name] for name in sorted(by_name)]
+
+
+def _reduce(measured: Figures, compact: Callable[[Figures], Figures]) -> Figures:
+    described = {key: measured[key] for key in DESCRIBED if key in measured}
+    return rounded(described | compact(measured))  # type: ignore[no-any-return]  # a mapping stays a mapping
+
+
+def write_result(path: Path, result: Figures) -> None:
+    """Write the result of a cell."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps(result, indent=1).encode())
 
 
 def write_all(path: Path, results: Sequence[Figures]) -> None:
@@ -64,17 +83,9 @@ def as_file_name(words: str) -> str:
     return words.replace(", ", "-").replace(" ", "-")
 
 
-def name_of(result: Figures) -> str:
-    """Return the name of the cell that a result of the methods study belongs to."""
-    return Cell(**result["cell"]).name
-
-
 def compact(measured: Figures) -> Figures:
     """Return the values of a measurement that the tables and plots of the methods study need."""
-    stored: Figures = {"cell": {key: value for key, value in measured["cell"].items() if key != "name"}}
-    stored |= {
-        key: measured[key] for key in ("trained_share", "adapter_mb", "cpu_minutes", "made_with") if key in measured
-    }
+    stored: Figures = {key: measured[key] for key in ("trained_share", "adapter_mb", "cpu_minutes") if key in measured}
     if "shifted" in measured:
         errors = measured["shifted"]
         stored["shifted"] = {key: errors[key] for key in ("rollout_over_persistence", *SHIFTED)}
@@ -83,7 +94,7 @@ def compact(measured: Figures) -> Figures:
     stored["reach"] = {distance: _episodes(result) for distance, result in measured["reach"].items()}
     if "baselines" in measured:
         stored["baselines"] = {name: _episodes(result) for name, result in measured["baselines"].items()}
-    return rounded(stored)  # type: ignore[no-any-return]  # a mapping stays a mapping
+    return stored
 
 
 def _episodes(measured: Figures) -> Figures:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from methods import PLANNING, TRAINING
 from prepare import BUILTIN, data_a
-from results import REACHED_CM, rounded
+from results import REACHED_CM
+from work import Work
 
 from vjepa2_ac.config import AdapterConfig, Config, ModelConfig, ReplayConfig, ValidationConfig
 from vjepa2_ac.config.training import CheckpointConfig
@@ -40,7 +40,7 @@ RECIPES: dict[Motions, MotionRecipe] = {
 """narrow: 1 cm to the front in every model step. varied: random reaching, up to 7.5 cm along each axis."""
 
 EPISODES, RECORDED, GOALS = 60, 31, 9_000  # demonstrations, seeds of the recordings and of the problems
-STEPS, EVERY = 800, 100
+SEEDS, STEPS, EVERY = 3, 800, 100
 
 OFFLINE = {
     "one_step": ("one_step.true", 1),
@@ -68,11 +68,15 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Cell:
+class Cell(Run):
     """One checkpoint of a run; step 0 is the base."""
 
-    run: Run
-    step: int
+    step: int = 0
+
+    @property
+    def run(self) -> Run:
+        """The run."""
+        return Run(self.motions, self.method, self.seed, self.cure)
 
     @property
     def name(self) -> str:
@@ -80,13 +84,13 @@ class Cell:
         return f"{self.run.name}-{self.step:04d}"
 
 
-def all_cells(seeds: int) -> Iterator[Cell]:
+def all_cells() -> Iterator[Cell]:
     """Yield the checkpoints of every run, the most important runs first."""
-    for seed in range(seeds):
+    for seed in range(SEEDS):
         for motions in RECIPES:
             yield from cells_of(Run(motions, "LoRA", seed))
             yield from cells_of(Run(motions, "full", seed))
-    for seed in range(seeds):
+    for seed in range(SEEDS):
         for run in (Run("narrow", "LoRA", seed), Run("narrow", "full", seed), Run("varied", "LoRA", seed)):
             yield from cells_of(replace(run, cure="replay"))
 
@@ -94,10 +98,16 @@ def all_cells(seeds: int) -> Iterator[Cell]:
 def cells_of(run: Run) -> list[Cell]:
     """Return the checkpoints of a run that are measured."""
     steps = (0, 200, 400, STEPS) if run.cure else range(0, STEPS + 1, EVERY)
-    return [Cell(run, step) for step in steps]
+    return [Cell(**asdict(run), step=step) for step in steps]
 
 
-def prepare(folder: Path) -> None:
+def prepare(cells: Sequence[Cell], work: Work) -> int:
+    """Record the demonstrations, and train the runs of the cells; return the number of runs that failed."""
+    record_demonstrations(work.folder)
+    return work.run(train_alone, [(run, work.folder) for run in dict.fromkeys(cell.run for cell in cells)])
+
+
+def record_demonstrations(folder: Path) -> None:
     """Record the missing demonstrations, and the random worlds of the base model's training for replay."""
     specs: dict[str, RecordingSpec] = {
         name: RecordingSpec(WORLD, seed=RECORDED, recipe=recipe) for name, recipe in RECIPES.items()
@@ -129,14 +139,12 @@ def make_config(run: Run, folder: Path) -> Config:
 
 
 def train_alone(run: Run, folder: Path) -> None:
-    """Train a run on one thread, from its newest checkpoint; a finished run returns at once."""
-    torch.set_num_threads(1)
+    """Train a run from its newest checkpoint; a finished run returns at once."""
     train(make_config(run, folder), SILENT)
 
 
-def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
-    """Measure a checkpoint of a trained run on one thread."""
-    torch.set_num_threads(1)
+def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
+    """Measure a checkpoint of a trained run."""
     config = make_config(cell.run, folder)
     home, step = Path(config.run_dir), str(cell.step)
     rows = [row for row in read_metrics_log(home / "metrics.jsonl") if row["kind"] == "validation"]
@@ -149,21 +157,15 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     result = run_task(spec, Planning(Controller(model, PLANNING)))
     measured = {row.key: row.value for row in make_rows(evaluation) if row.model == evaluation.trained}
     return {
-        "cell": asdict(cell.run) | {"step": cell.step},
         "validation": validated,
         "offline": {name: sign * measured[key] for name, (key, sign) in OFFLINE.items()},
         "distance_cm": result.distance_cm.round(3).tolist(),
     }
 
 
-def name_of(result: dict[str, Any]) -> str:
-    """Return the name of the checkpoint that a result belongs to."""
-    return Cell(run_of(result), result["cell"]["step"]).name
-
-
 def run_of(result: dict[str, Any]) -> Run:
     """Return the run that a result belongs to."""
-    return Run(**{key: value for key, value in result["cell"].items() if key != "step"})
+    return Cell(**result["cell"]).run
 
 
 def compact(measured: dict[str, Any]) -> dict[str, Any]:
@@ -171,7 +173,6 @@ def compact(measured: dict[str, Any]) -> dict[str, Any]:
     ends = [actions[-1] for actions in measured["distance_cm"]]
     validation = measured["validation"]
     kept = {
-        "cell": measured["cell"],
         "error": validation["rollout_over_persistence_last"],
         "action_ranking_error": validation["action_ranking_error"],
         "left_cm": float(np.mean(ends)),
@@ -180,4 +181,4 @@ def compact(measured: dict[str, Any]) -> dict[str, Any]:
     }
     if not measured["cell"]["cure"]:  # correlations are computed on runs without a cure
         kept["offline"] = measured["offline"]
-    return rounded(kept)  # type: ignore[no-any-return]  # a mapping stays one
+    return kept

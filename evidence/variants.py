@@ -20,12 +20,11 @@ import numpy as np
 import torch
 from failing_variants import STRIDE, VARIANTS, Groups, Recordings
 from jaxtyping import Float
-from measure import describe_software
 from methods import IN_OUT, PLANNING, TRAINING
 from offline import measure_offline
 from prepare import BUILTIN
-from results import rounded
 from torch import Tensor, nn
+from work import Work
 
 from vjepa2_ac.config import AdapterConfig, ModelConfig
 from vjepa2_ac.episode import LatentBatch
@@ -125,16 +124,20 @@ class Seed:
         return folder / f"recordings-{self.number}.pt"
 
 
-def all_cells(seeds: int) -> Iterator[Cell]:
+def all_cells() -> Iterator[Cell]:
     """Yield all cells, seed by seed."""
-    for seed in range(min(seeds, SEEDS)):
+    for seed in range(SEEDS):
         for method in (BASE, *METHODS):
             yield Cell(method, seed)
 
 
-def prepare(seed: Seed, folder: Path) -> None:
+def prepare(cells: Sequence[Cell], work: Work) -> int:
+    """Make the recordings of the cells' seeds; return the number of seeds that failed."""
+    return work.run(prepare_seed, [(Seed(number), work.folder) for number in sorted({cell.seed for cell in cells})])
+
+
+def prepare_seed(seed: Seed, folder: Path) -> None:
     """Record and encode the demonstrations of a seed, its held-out episodes, and the failing variants of both."""
-    torch.set_num_threads(1)
     path = seed.path(folder)
     if not path.exists():
         model, last = _load_base_model(), DEMONSTRATIONS + HELD_OUT
@@ -153,11 +156,10 @@ def load_recordings(path: Path) -> tuple[Recordings, Recordings]:
 
 def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Train and measure a cell on one thread."""
-    torch.set_num_threads(1)
     seed = Seed(cell.seed)
     recordings, held_out = load_recordings(seed.path(folder))
     model = _load_base_model()
-    result: dict[str, Any] = {"cell": asdict(cell), "made_with": describe_software()}
+    result: dict[str, Any] = {}
     if cell.method != BASE:
         result["training"] = train(model, METHODS[cell.method], recordings, cell.seed)
     model.eval()
@@ -165,16 +167,6 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     problems = BenchmarkOptions("reach", seed.spec.worlds, goals, GOALS_SEED + 100 * cell.seed, films=0)  # type: ignore[arg-type]
     run = run_task(problems, Planning(Controller(model, PLANNING)))
     return result | {"ends_cm": run.distance_cm[:, -1].tolist()}
-
-
-def name_of(result: dict[str, Any]) -> str:
-    """Return the name of the cell that a result belongs to."""
-    return Cell(**result["cell"]).name
-
-
-def compact(result: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of a measurement that the tables need."""
-    return rounded(result)  # type: ignore[no-any-return]  # a mapping stays a mapping
 
 
 def _load_base_model() -> WorldModel:

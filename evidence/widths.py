@@ -8,19 +8,17 @@ Yang et al. 2022 (arXiv 2203.03466, µP, for hidden matrices and Adam).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from labs import Cell as LabCell
-from labs import closed_loop, evaluate, get_lab, make_config
-from labs import prepare as prepare_lab
-from measure import describe_software
+from labs import closed_loop, evaluate, get_lab, make_config, prepare_lab
 from methods import PLANNING
 from prepare import BASE_CONFIG, BUILTIN, base_data, prepare_base_data
 from results import as_file_name
+from work import Work
 
 from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.config.loading import load_config
@@ -90,9 +88,14 @@ def prepare_data(folder: Path, workers: int) -> None:
         prepare_lab(get_lab(number), folder)
 
 
-def prepare(base: BaseModel, folder: Path) -> None:
+def prepare(cells: Sequence[Cell], work: Work) -> int:
+    """Make the data and the base models of the cells; return the number of base models that failed."""
+    prepare_data(work.folder, work.workers)
+    return work.run(prepare_base, [(base, work.folder) for base in dict.fromkeys(cell.base for cell in cells)])
+
+
+def prepare_base(base: BaseModel, folder: Path) -> None:
     """Pre-train a base model on one thread."""
-    torch.set_num_threads(1)
     if _base_folder(folder, base.width).exists():
         return
     fresh = folder / f"fresh-width-{base.width}"
@@ -145,8 +148,7 @@ def make_cell_config(cell: Cell, folder: Path, rate: float) -> Config:
 
 def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Train and measure a cell on one thread."""
-    torch.set_num_threads(1)
-    result: dict[str, Any] = {"cell": asdict(cell), "made_with": describe_software()}
+    result: dict[str, Any] = {}
     if cell.method == BASE:
         subject = load_base(make_cell_config(cell, folder, RATES[0]).model, seed=0).eval()
     else:
@@ -162,8 +164,3 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
 def _validated_ranking(run: Path) -> float:
     rows = [row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] == "validation"]
     return float(rows[-1][RANKING_ERROR])
-
-
-def name_of(result: dict[str, Any]) -> str:
-    """Return the name of the cell that a result belongs to."""
-    return Cell(**result["cell"]).name

@@ -1,10 +1,11 @@
 """The evidence: its page shows the stored results, and each kind of cell can be measured."""
 
 import json
+import runpy
 import shlex
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -43,18 +44,55 @@ def stored(evidence: Any) -> list[dict[str, Any]]:
 
 
 def test_condition_names_are_unique_and_each_stored_result_has_a_condition(evidence: Any, stored: Any) -> None:
-    cells = list(evidence.methods.all_cells(at_most=5))
+    cells = list(evidence.methods.all_cells())
     assert len({cell.name for cell in cells}) == len(set(cells)) == len(cells)
     assert not any("/" in cell.name for cell in cells), "names of files"
-    names = {evidence.results.name_of(result) for result in stored}
+    names = {evidence.methods.Cell(**result["cell"]).name for result in stored}
     assert len(names) == len(stored)
     assert {cell.name for cell in cells} <= names, "every cell is measured"
-    checkpoints = list(evidence.selection.all_cells(seeds=3))
+    checkpoints = list(evidence.selection.all_cells())
     selection = json.loads((evidence.results.RESULTS / "selection.json").read_text())
-    assert {cell.name for cell in checkpoints} <= {evidence.selection.name_of(result) for result in selection}
+    assert set(checkpoints) <= {evidence.selection.Cell(**result["cell"]) for result in selection}
     searches = list(evidence.iterations.all_cells())
     assert len({cell.name for cell in searches}) == len(searches)
-    assert all(evidence.iterations.name_of({"cell": vars(cell)}) == cell.name for cell in searches)
+
+
+def test_every_study_has_cells_that_its_stored_results_name(evidence: Any) -> None:
+    program = runpy.run_path(str(ROOT / "evidence/__main__.py"), run_name="evidence")
+    for name, (module, tables) in program["STUDIES"].items():
+        study = getattr(evidence, module)
+        assert callable(study.prepare)
+        assert callable(study.measure)
+        assert callable(getattr(evidence, tables).write_tables)
+        names = [cell.name for cell in getattr(evidence, "methods" if name == "methods" else module).all_cells()]
+        assert len(set(names)) == len(names)
+        for cell in study.all_cells():
+            assert study.Cell(**json.loads(json.dumps(asdict(cell)))).name == cell.name
+
+
+def test_failed_cells_are_counted_and_results_replace_the_stored_ones(evidence: Any, tmp_path: Path) -> None:
+    (tmp_path / "study_of_a_test.py").write_text(
+        "def measure(cell, folder, goals):\n"
+        "    if cell.lab == 2:\n"
+        "        raise ValueError('broken')\n"
+        "    return {'value': goals / 3, 'unused': 1}\n"
+    )
+    cells, folder = [evidence.labs.Cell(lab, "base model") for lab in (1, 2)], tmp_path / "labs"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(tmp_path)
+        assert evidence.work.Work(tmp_path, workers=1).measure("labs", "study_of_a_test", cells[1:], 7) == 1
+        result = evidence.work.measure_cell(cells[0], "study_of_a_test", tmp_path, 7)
+    assert not folder.exists(), "the failed cell has no result"
+    evidence.results.write_result(folder / f"{cells[0].name}.json", result)
+    stored = tmp_path / "stored.json"
+    evidence.results.write_all(stored, [{"cell": asdict(cells[0]), "value": 0.0}, {"cell": asdict(cells[1])}])
+    first, second = evidence.results.read_all(
+        folder, stored, lambda result: {"value": result["value"]}, evidence.labs.Cell
+    )
+    assert first.pop("core_minutes") >= 0
+    assert set(first.pop("made_with")) == {"torch", "commit"}
+    assert first == {"cell": {"lab": 1, "method": "base model"}, "goals": 7, "value": 2.3333333}
+    assert second == {"cell": {"lab": 2, "method": "base model"}}
 
 
 def test_tables_of_the_page_equal_the_stored_results(evidence: Any, stored: Any) -> None:
@@ -163,7 +201,6 @@ def test_experimental_condition_is_trained_and_measured(small: Any, method: str)
     result = json.loads(json.dumps(small.measure.measure(cell, small.folder, 1)))
     assert len(result["reach"]["l1"]["distance_cm"][0]) == 9
     assert ("offline" in result) == ("shifted" in result) == (method != "behaviour cloning")
-    assert set(result["made_with"]) == {"torch", "commit"}
     assert (result["trained_share"] == 0) == (method == "zero-shot")
     compact = small.results.compact(result)
     row = small.tables._row(method, "20", [compact])
@@ -222,8 +259,8 @@ def test_table_of_tasks_has_a_column_for_each_measured_kind_of_goals(evidence: A
 
 
 def test_runs_of_the_selection_study_differ_and_the_plots_are_drawn(evidence: Any, stored: Any, tmp_path: Path) -> None:
-    runs = {cell.run for cell in evidence.selection.all_cells(seeds=1)}
-    assert len(runs) == 7
+    runs = {cell.run for cell in evidence.selection.all_cells()}
+    assert len(runs) == 7 * evidence.selection.SEEDS
     for run in runs:
         assert (evidence.selection.make_config(run, tmp_path).replay is not None) == (run.cure == "replay")
     evidence.tables.draw(stored, tmp_path / "plot.png")
@@ -254,7 +291,7 @@ def test_pretrained_prior_of_a_lab_starts_from_the_prior_of_the_base_data(
     monkeypatch.setattr(evidence.prepare, "BASE_EPISODES", 4)
     monkeypatch.setattr(evidence.prepare, "RecordingSpec", partial(RecordingSpec, steps=14))
     labs.prepare_base_prior(tmp_path)
-    labs.prepare(lab, tmp_path)
+    labs.prepare_lab(lab, tmp_path)
     cell = labs.Cell(1, labs.PRETRAINED_PRIOR)
     result = labs.measure(cell, tmp_path, 1)
     assert len(result["closed_loop"]["newest"]) == 1
@@ -262,7 +299,8 @@ def test_pretrained_prior_of_a_lab_starts_from_the_prior_of_the_base_data(
     base_card, base_prior = load_prior(tmp_path / "base-prior", where="test")
     assert (card.data, base_card.data) == (str(tmp_path / "data-1"), str(tmp_path / "data-base"))
     assert torch.equal(prior.outer.weight, base_prior.outer.weight)
-    compared = rates.measure(rates.Cell(1, labs.PRETRAINED_PRIOR, 1e-3, 0), tmp_path)
+    cell = rates.Cell(1, labs.PRETRAINED_PRIOR, 1e-3, 0)
+    compared = {"cell": asdict(cell)} | rates.measure(cell, tmp_path, 0)
     assert compared["error"] == result["held_out"]["true_goals"]["value"]
     assert f"| {labs.PRETRAINED_PRIOR} | 0.001 | 0 | 1 | {compared['error']:.3f} | not defined |" in rates.table(
         [compared]
@@ -511,9 +549,6 @@ def test_base_models_of_all_widths_share_the_encoder_and_the_depth(evidence: Any
     assert len({model.encoder_fingerprint() for model in models}) == 1
 
 
-def test_cells_of_the_studies_with_own_base_models_have_distinct_names(evidence: Any, tmp_path: Path) -> None:
-    for study in (evidence.widths, evidence.bases):
-        cells = list(study.all_cells())
-        assert len({cell.name for cell in cells}) == len(cells)
+def test_one_base_model_of_the_bases_study_is_the_built_in_one(evidence: Any, tmp_path: Path) -> None:
     builtin = [base for base in evidence.bases.BASES if evidence.bases.BaseModel(*base).location(tmp_path)[:1] != "/"]
     assert builtin == [("random", 0)]

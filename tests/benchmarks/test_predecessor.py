@@ -98,7 +98,7 @@ def small_folder(study: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         patch.setattr(study, "WARMUP", 1)
         patch.setattr(study, "SHORT", 2)
         write_synthetic_droid(folder / "data-predecessor", episodes=16, steps=41, size=(36, 64))
-        study.prepare(folder)
+        study.prepare_views(folder)
         yield folder
 
 
@@ -113,7 +113,8 @@ def small_folder(study: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 def test_condition_of_the_study_is_trained_and_measured(
     study: Any, small_folder: Path, condition: str, views: list[str]
 ) -> None:
-    result = json.loads(json.dumps(study.measure(study.Cell(condition, 0), small_folder, 1)))
+    cell = study.Cell(condition, 0)
+    result = {"cell": vars(cell)} | json.loads(json.dumps(study.measure(cell, small_folder, 1)))
     assert list(result["measured"]) == views
     for measured in result["measured"].values():
         value, low, high = measured["offset_cm"]
@@ -126,6 +127,6 @@ def test_condition_of_the_study_is_trained_and_measured(
         topics = {study.tables.describe_topic(warning) for warning in result["check"]}
         assert {"camera", "model step", "warm-up", "no validation"} <= topics
         assert result["train"][: len(result["check"])] == result["check"]
-    grouped = study.tables.group_results([study.compact(result)])
+    grouped = study.tables.group_results([result])
     assert study.tables.measurements_table(grouped).count("\n") == 1 + len(views)
     assert study.tables.conditions_table(grouped).count("not measured") > 0
