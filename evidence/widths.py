@@ -1,7 +1,7 @@
 """The widths study: does the rank that LoRA needs grow with the width of the predictor?
 
 Predictors of three widths have the same depth, and are pre-trained with the same data and the same number of steps.
-Each is then fine-tuned in three labs with LoRA of several ranks and in full. Of two learning rates, the one with the
+Each is then fine-tuned in two labs with LoRA of several ranks and in full. Of two learning rates, the one with the
 lower action-ranking error on the validation episodes of the lab is used. All rates are divided by the width, as in
 Yang et al. 2022 (arXiv 2203.03466, µP, for hidden matrices and Adam).
 """
@@ -37,7 +37,7 @@ from vjepa2_ac.training.validation import RANKING_ERROR
 WIDTHS, DEPTH, HEAD_DIM = (128, 256, 384), 2, 32
 RANKS, FULL, BASE = (1, 4, 16, 64), "full fine-tuning", "base model"
 METHODS = (BASE, *(f"LoRA, rank {rank}" for rank in RANKS), FULL)
-LABS = (1, 2, 4)
+LABS = (1, 2)
 RATES = (1.5e-3, 5e-3)  # of predictors with width 128
 BASE_STEPS, BASE_RATE = 5_000, 1.5e-3
 

@@ -11,7 +11,7 @@ import pytest
 import vjepa2_ac
 from vjepa2_ac.cli.closed_loop import _make_summary
 from vjepa2_ac.cli.evaluate import _recommend_next
-from vjepa2_ac.cli.options import QUICK_OVERRIDES, make_option_words, make_quick_overrides, parse_arguments
+from vjepa2_ac.cli.options import FAST, make_option_words, parse_arguments, propose_fast_search
 from vjepa2_ac.cli.program import _make_parser
 from vjepa2_ac.config.loading import config_as_yaml, load_config
 from vjepa2_ac.config.planning import PlanningConfig
@@ -54,7 +54,7 @@ def test_option_words_parse_to_the_same_options() -> None:
 def test_quick_search_is_proposed_on_a_cpu_unless_the_config_sets_the_search(
     words, settings, *, on_cpu: bool, is_quick: bool
 ) -> None:
-    assert make_quick_overrides(words, PlanningConfig(**settings), on_cpu=on_cpu) == [*QUICK_OVERRIDES] * is_quick
+    assert propose_fast_search(words, PlanningConfig(**settings), on_cpu=on_cpu) == [FAST] * is_quick
 
 
 def get_next_command(
@@ -102,8 +102,7 @@ def test_simulate_is_recommended_only_for_simulated_data(monkeypatch: pytest.Mon
     recorded = RecordedSimulation.of(RecordingSpec("B", task="pick"), 3)
     monkeypatch.setattr(record, "read_simulation", lambda _: recorded)
     (command,) = get_next_command(arguments)
-    quick = "planning.samples=64 planning.iterations=4"
-    expected = f"simulate builtin:sim-tiny --task pick --domain B --checkpoint 8 {quick}"
+    expected = f"simulate builtin:sim-tiny --task pick --domain B --checkpoint 8 {FAST}"
     assert command == f"Next: vjepa2-ac {expected}"
     parse(shlex.split(expected))
 

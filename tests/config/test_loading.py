@@ -207,3 +207,16 @@ def test_config_larger_than_a_megabyte_raises_before_parsing(tmp_path: Path, mon
     for read in (load_config, load_config_of_run):
         with pytest.raises(InputError, match=r"too large.*at most 1,000,000 bytes"):
             read(path)
+
+
+def test_preset_sets_the_size_of_the_search_at_its_position_among_the_overrides() -> None:
+    def sizes(*overrides: str) -> tuple[int, int]:
+        planning = parse_config(MINIMAL, overrides, where="here").planning
+        return planning.samples, planning.iterations
+
+    assert sizes("planning.preset=paper") == (800, 10)
+    assert sizes("planning.preset=fast") == (64, 4)
+    assert sizes("planning.preset=fast", "planning.iterations=2") == (64, 2)
+    assert sizes("planning.iterations=2", "planning.preset=fast") == (64, 4)
+    with pytest.raises(InputError, match=r"planning.preset=quick.*no preset.*one of fast, paper"):
+        sizes("planning.preset=quick")

@@ -161,7 +161,7 @@ def _make_simulate_words(about: About, options: argparse.Namespace) -> list[str]
         return []
     task, domain = recorded.task or "reach", recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
     config = load_planning_config(about.subject, overrides=options.overrides)
-    quick = cli.make_quick_overrides(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
+    fast = cli.propose_fast_search(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
     words = [
         "simulate",
         about.subject,
@@ -171,7 +171,7 @@ def _make_simulate_words(about: About, options: argparse.Namespace) -> list[str]
         domain,
         *cli.make_option_words(options, "checkpoint"),
     ]
-    return [*words, *options.overrides, *quick]
+    return [*words, *options.overrides, *fast]
 
 
 def _compare(options: argparse.Namespace) -> None:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import load_config, load_config_of_run
-from vjepa2_ac.config.planning import ELITES, PlanningConfig
+from vjepa2_ac.config.loading import expand_presets, load_config, load_config_of_run
+from vjepa2_ac.config.planning import ELITES, PRESETS, PlanningConfig
 from vjepa2_ac.errors import InputError, did_you_mean, printable, shell_command
 from vjepa2_ac.process import is_first_process
 from vjepa2_ac.reporter import INDEXING
@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 Handler = Callable[[argparse.Namespace], int | None]
 
-QUICK = {"samples": 64, "iterations": 4}  # `planning` keys of a fast search on a CPU; docs/planning.md rates its plans
-QUICK_OVERRIDES = tuple(f"planning.{key}={value}" for key, value in QUICK.items())
-_QUICK_SEQUENCES = 256  # a search on a CPU with more action sequences takes long
+FAST = "planning.preset=fast"
 _MAX_COUNT = 10**9
 _OPTION = re.compile(r"-(?![\d.])")  # a word such as -0.3 is a value, not an option
 _Record = TypeVar("_Record")
@@ -368,8 +366,8 @@ def parse_arguments(parser: argparse.ArgumentParser, arguments: Sequence[str] | 
     if non_overrides and vars(options).get("subject") != "record":  # the argument of `simulate record` is a folder
         words = " ".join(non_overrides)
         parser.error(f"{words!r} is not key=value (write numbers in one word, such as 0.4,0,0.3)")
-    if rest:
-        options.overrides = [*options.overrides, *rest]
+    if takes_overrides:
+        options.overrides = expand_presets([*options.overrides, *rest])
     return options
 
 
@@ -470,8 +468,8 @@ def make_option_words(options: argparse.Namespace, *names: str) -> list[str]:
     return words
 
 
-def make_quick_overrides(words: Sequence[str], planning: PlanningConfig, *, on_cpu: bool) -> list[str]:
-    """Return the overrides of the quick search if a search on a CPU would take long.
+def propose_fast_search(words: Sequence[str], planning: PlanningConfig, *, on_cpu: bool) -> list[str]:
+    """Return the override for the fast preset if a search on a CPU would take long.
 
     Args:
         words: The user's overrides. If they set the size of the search, the result is empty.
@@ -482,5 +480,6 @@ def make_quick_overrides(words: Sequence[str], planning: PlanningConfig, *, on_c
 
     is_chosen = any(word.startswith(("planning.samples=", "planning.iterations=")) for word in words)
     is_sampled, elites = planning.planner.name != "gradient", planning.planner.options.get("elites", ELITES)
-    is_long = is_sampled and planning.budget_s is None and sum(count_samples_per_iteration(planning)) > _QUICK_SEQUENCES
-    return [*QUICK_OVERRIDES] if on_cpu and is_long and not is_chosen and elites <= QUICK["samples"] else []
+    samples, iterations = PRESETS["fast"].values()
+    is_long = planning.budget_s is None and sum(count_samples_per_iteration(planning)) > samples * iterations
+    return [FAST] if on_cpu and is_sampled and is_long and not is_chosen and elites <= samples else []

@@ -19,14 +19,13 @@ if TYPE_CHECKING:
 
     from vjepa2_ac.planning.goals import SubGoal
 
-_QUICK = " ".join(cli.QUICK_OVERRIDES)
 _COLUMNS = 100
 
 
 def add_plan(commands: cli.Commands) -> None:
     """Add `plan` to a parser."""
     parser = cli.add_command(commands, "plan", _plan, "demo/run --start a.png --goal b.png --state 0.4,0,0.3,3,0,0,0")
-    cli.add_planner(parser, f"such as planning.horizon=2; for a CPU: {_QUICK}")
+    cli.add_planner(parser, f"such as planning.horizon=2; for a CPU: {cli.FAST}")
     cli.add(parser, "--start IMAGE", "the current camera image: PNG or JPEG", cli.as_local, required=True)
     text = "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or a vector"
     cli.add(parser, "--state NUMBERS", text, cli.as_numbers, required=True)
@@ -136,8 +135,8 @@ def _describe_search(config: PlanningConfig, *, on_cpu: bool) -> str:
     )
     text = f"Planning: {sequences} of {steps} in {counted(config.iterations, 'iteration')}"
     text += "" if config.budget_s is None else f", for {config.budget_s:g} s at most"
-    quick = cli.make_quick_overrides([], config, on_cpu=on_cpu)
-    return f"{text}." + f"\nQuick, for a CPU: {_QUICK}" * bool(quick)
+    proposed = cli.propose_fast_search([], config, on_cpu=on_cpu)
+    return f"{text}." + f"\nFaster, for a CPU: {cli.FAST}" * bool(proposed)
 
 
 def _read_images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import source_of
 from vjepa2_ac.config.model import RANDOM
+from vjepa2_ac.config.planning import PRESETS
 from vjepa2_ac.config.removed import drop_removed_keys, explain_removed_key, move_component_options, move_norm_limit
 from vjepa2_ac.config.run import ReplayConfig, with_complete_replay
 from vjepa2_ac.config.section import collect_effects, to_data_key
@@ -121,7 +122,7 @@ def parse_config(
         drop_removed_keys(plain, where)
         move_norm_limit(plain, where)
         move_component_options(plain, where)
-    for override in overrides:
+    for override in expand_presets(overrides):
         key, separator, text = override.partition("=")
         if not separator or not key:
             raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
@@ -136,6 +137,24 @@ def parse_config(
         lines = _describe_wrong_values(error)
     problem = "\n  ".join([f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong", *lines]) + "\n"
     raise InputError(where=where, found=problem, fix="`vjepa2-ac config schema` lists every key with its range")
+
+
+def expand_presets(overrides: Iterable[str]) -> list[str]:
+    """Return overrides in which the keys of the preset replace `planning.preset=NAME`.
+
+    Raises:
+        InputError: There is no preset of that name.
+    """
+    expanded = list[str]()
+    for override in overrides:
+        key, _, name = override.partition("=")
+        if key != _PRESET:
+            expanded.append(override)
+        elif name in PRESETS:
+            expanded += [f"planning.{size}={value}" for size, value in PRESETS[name].items()]
+        else:
+            raise InputError(where=f"override {override}", found="no preset", needed=f"one of {', '.join(PRESETS)}")
+    return expanded
 
 
 def config_as_dict(config: Config) -> dict[str, Any]:
@@ -179,6 +198,7 @@ def changed_keys(old: Config, new: Config) -> list[str]:
     return sorted(key for key in flat_old.keys() | flat_new.keys() if flat_old.get(key) != flat_new.get(key))
 
 
+_PRESET = "planning.preset"
 _NO_BREAKS = 10**6  # characters per line, so that YAML breaks no line
 
 

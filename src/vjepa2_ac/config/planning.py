@@ -24,6 +24,8 @@ from vjepa2_ac.registry import ENERGIES, PLANNERS
 Coordinate = Annotated[float, Field(ge=-5.0, le=5.0)]  # coordinate in the base frame in metres; no arm reaches farther
 Corner = tuple[Coordinate, Coordinate, Coordinate]
 ELITES = 10  # default of the option `elites` of the planners cem and icem
+PRESETS = {"fast": {"samples": 64, "iterations": 4}, "paper": {"samples": 800, "iterations": 10}}
+"""Sizes of a search by name, for the override `planning.preset=NAME`. docs/planning.md compares them."""
 Metre = ZeroToOne  # no arm moves farther than 1 m in a model step; larger values are probably millimetres
 
 
