@@ -177,8 +177,9 @@ def test_prior_command_writes_into_the_run_and_prints_the_planning_command(
     assert "relative to the zero action" in printed
     assert "planning.prior=" in printed
     further = ["prior", str(whole_run), "--steps", "3", "--out", str(tmp_path / "further"), "--pretrained", str(out)]
-    assert main(further) == 0
-    assert json.loads((tmp_path / "further" / CARD).read_text())["pretrained"] == str(out)
+    assert main([*further, "--learning-rate", "0.01"]) == 0
+    card = json.loads((tmp_path / "further" / CARD).read_text())
+    assert (card["pretrained"], card["learning_rate"]) == (str(out), 0.01)
     assert main(["prior", str(tmp_path)]) == 2
 
 

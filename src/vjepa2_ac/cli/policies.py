@@ -34,6 +34,7 @@ def add_prior(commands: cli.Commands) -> None:
     cli.add_overrides(parser, "config keys to change, such as training.device=cpu")
     cli.add(parser, "--out FOLDER", "output folder (prior in the run's folder)", cli.as_path)
     cli.add(parser, "--steps N", "optimizer steps (2000)", cli.count)
+    cli.add(parser, "--learning-rate X", "peak learning rate (0.001)", cli.number_between(0, 1))
     text = "a prior for the same encoder; training starts from its weights (random weights)"
     cli.add(parser, "--pretrained FOLDER", text, cli.as_path)
     cli.add(

@@ -76,6 +76,7 @@ class PriorCard:
     crop: str  # data.crop
     data: str  # data.path
     steps: int
+    learning_rate: float | None = None  # None: not recorded, in priors before 2026-12-01
     held_out: Mapping[str, Any] = field(default_factory=dict)
     pretrained: str = ""  # the folder of the prior from whose weights the training started; empty: random weights
     version: str = __version__
@@ -282,6 +283,7 @@ def train_prior(
         crop=data.crop,
         data=data.path,
         steps=options.steps,
+        learning_rate=options.learning_rate,
         held_out=_measure(dataset, model, prior, spaces),
         pretrained=str(options.pretrained or ""),
         time=utc_now(),
