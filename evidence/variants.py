@@ -2,7 +2,8 @@
 
 Each method changes the loss of LoRA fine-tuning: longer rollouts, failing variants of the demonstrations as data, a
 contrastive term on them, or a larger weight of the action-relative part of the error. All methods have the same
-demonstrations, order of clips, number of steps and learning rates.
+demonstrations, order of clips, number of steps and learning rates. Seed 0 was used to choose `CONTRAST_WEIGHT` and
+`RESTART`; seeds 1 to 5 are measured.
 
 Ideas: rollouts of 10 steps in the decay phase (RoboJEPA, arXiv 2610.10515), executed failing variants (CureWM, arXiv
 2610.09134), common and action-relative error (arXiv 2610.05550). The losses are ours.
@@ -57,7 +58,9 @@ SCHEDULE = TRAINING.model_copy(
 ADAPTER = AdapterConfig(rank=32, alpha=64.0, dropout=0.0, modules_to_save=IN_OUT)
 FRAMES, LONG = 4, 11  # frames of teacher forcing, and of a clip: a rollout of 10 steps has 11 frames
 BATCH, GROUPS, FAILURES = 6, 2, 3  # clips; groups and failing variants of each group, in each step
-MARGIN, RELATIVE_WEIGHT = 0.5, 3.0  # margin relative to the executed distance; weight of the action-relative error
+MARGIN, CONTRAST_WEIGHT = 0.5, 0.1  # margin relative to the executed distance; weight of the contrastive loss
+RELATIVE_WEIGHT = 3.0  # weight of the action-relative error
+RESTART = 20  # steps in which the learning rate rises again after a change of the loss; without it, training diverges
 
 
 @dataclass(frozen=True)
@@ -126,7 +129,7 @@ class Seed:
 
 def all_cells() -> Iterator[Cell]:
     """Yield all cells, seed by seed."""
-    for seed in range(SEEDS):
+    for seed in range(1, SEEDS + 1):
         for method in (BASE, *METHODS):
             yield Cell(method, seed)
 
@@ -187,10 +190,11 @@ def train(model: WorldModel, method: Method, recordings: Recordings, seed: int) 
     clip_rng, group_rng = (np.random.default_rng([SEED, seed, purpose]) for purpose in (1, 2))
     model.train()
     for step in range(1, SCHEDULE.steps + 1):
+        decaying = step - (SCHEDULE.steps - SCHEDULE.decay_steps)  # number of steps in the decay phase
+        rollout = method.decay_rollout if decaying > 0 else method.rollout
+        is_new = decaying > 0 and method.decay_rollout != method.rollout
         for group in optimizer.param_groups:
-            group["lr"] = learning_rate_at(step, SCHEDULE)
-        is_decaying = step > SCHEDULE.steps - SCHEDULE.decay_steps
-        rollout = method.decay_rollout if is_decaying else method.rollout
+            group["lr"] = learning_rate_at(step, SCHEDULE) * (min(1.0, decaying / RESTART) if is_new else 1.0)
         losses = clip_losses(model, draw_clips(recordings, clip_rng), rollout)
         if method.has_variants:
             losses |= variant_losses(model, draw_groups(recordings.groups, group_rng), method)
@@ -262,7 +266,8 @@ def variant_losses(model: WorldModel, groups: Groups, method: Method) -> dict[st
         energies, executed = (
             (ends - goal).abs().mean(dim=(2, 3)) for ends in (predicted[:, :, -1], true_latents[:, :, -1])
         )
-        losses["contrast"] = (MARGIN * executed[:, 1:] + energies[:, :1] - energies[:, 1:]).clamp(min=0).mean()
+        hinge = (MARGIN * executed[:, 1:] + energies[:, :1] - energies[:, 1:]).clamp(min=0).mean()
+        losses["contrast"] = CONTRAST_WEIGHT * hinge
     return losses
 
 
