@@ -41,8 +41,8 @@ CANDIDATES: dict[str, tuple[tuple[float, ...], tuple[int, ...]]] = {  # by metho
     "LoRA, rank 4": ((1e-3, 3e-3, 9e-3), (STEPS,)),
     "LoRA, rank 32": ((1e-3, 3e-3, 9e-3), (STEPS,)),
     "full fine-tuning": ((1.3e-3, 4e-3, 1.2e-2), (STEPS,)),
-    PRIOR: ((3e-4, 1e-3, 3e-3), (2_000,)),
-    PRETRAINED_PRIOR: ((1e-4, 3e-4, 1e-3), (500, 2_000)),
+    PRIOR: ((3e-4, 1e-3, 3e-3, 1e-2), (2_000,)),
+    PRETRAINED_PRIOR: ((1e-4, 3e-4, 1e-3, 3e-3, 1e-2), (500, 2_000)),
 }
 
 
