@@ -33,6 +33,7 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.policies.action_prior import PriorOptions, train_prior
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST, SELECTED, select_checkpoint
+from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.runs.subject import load_subject
 from vjepa2_ac.simulation.benchmark import BenchmarkOptions, Planning, run_task
 from vjepa2_ac.simulation.domains import Domain, DomainRanges, sample_domain
@@ -66,9 +67,9 @@ METHODS = (
 the weights of a prior that was trained on the training data of the base model, as LoRA starts from the base model."""
 
 BASE_PRIOR = PriorOptions(steps=8_000)
-FINE_TUNING = PriorOptions(steps=500, learning_rate=3e-4)
-"""Training of a prior on the base model's data, and its fine-tuning in a lab. Both are assumed, not yet chosen:
-`python evidence --study rates` compares them with other values on labs that are not part of this study."""
+SCRATCH, FINE_TUNING = PriorOptions(learning_rate=1e-2), PriorOptions(steps=500, learning_rate=1e-2)
+"""Training of a prior on the base model's data; in a lab from random weights; and in a lab from the prior of the base
+model's data. `python evidence --study rates` selected the options in a lab, on labs that are not part of this study."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ def _base_prior(folder: Path) -> Path:
 
 def make_prior_options(method: str, folder: Path) -> PriorOptions:
     """Return the options of the training of a prior in a lab."""
-    return replace(FINE_TUNING, pretrained=_base_prior(folder)) if method == PRETRAINED_PRIOR else PriorOptions()
+    return replace(FINE_TUNING, pretrained=_base_prior(folder)) if method == PRETRAINED_PRIOR else SCRATCH
 
 
 def make_data_config(lab: Lab, folder: Path) -> DataConfig:
@@ -208,6 +209,7 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
         run = train(config, SILENT)
         selected, newest = (select_checkpoint(run, name).path.name for name in (SELECTED, NEWEST))
         result |= {"selected": selected, "newest": newest, "evaluation": {}, "closed_loop": {}}
+        result["validations"] = list_validations(run)
         for name in dict.fromkeys((NEWEST, SELECTED)):
             if name == SELECTED and selected == newest:
                 continue
@@ -215,6 +217,20 @@ def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
             model = load_subject(run, name).world_model
             result["closed_loop"][name] = reach(Planning(Controller(model, PLANNING)))
     return result
+
+
+def list_validations(run: Path) -> list[dict[str, Any]]:
+    """Return the errors of every validation of a run, as `results.select_step` needs them."""
+    key = "action_ranking_error"
+    return [
+        {
+            "step": row["step"],
+            "rollout_error": row["rollout_over_persistence_last"],
+            "ranking": [row[name] for name in (key, f"{key}_low", f"{key}_high")],
+        }
+        for row in read_metrics_log(run / "metrics.jsonl")
+        if row["kind"] == "validation"
+    ]
 
 
 def closed_loop(cell: Cell, goals: int) -> Any:
