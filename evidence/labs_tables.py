@@ -6,15 +6,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from labs import LABS, METHODS, PRETRAINED_PRIOR, TUNING_LABS, get_lab
-from results import REACHED_CM, Figures
+from labs import DIVERSE, LABS, METHODS, PRETRAINED_PRIOR, TUNING_LABS, get_lab
+from results import REACHED_CM, Figures, select_step
 from tables import insert_table, rate_choices
 
-from vjepa2_ac.evaluation.summary import RANKING
+from vjepa2_ac.evaluation.summary import PREDICTION, RANKING
 from vjepa2_ac.intervals import estimate_share
 from vjepa2_ac.runs.checkpoint import NEWEST, SELECTED, checkpoint_name
 
-GAIN = 0.10  # a gain of the success rate that justifies adapting
+GAIN = 10.0  # percentage points; a gain of the success rate that justifies adapting
+DRAWN = "new camera"  # condition of the labs that were drawn at random; the others were chosen
 BASE, TRAINED = METHODS[0], ("LoRA, rank 4", "LoRA, rank 32", "full fine-tuning")
 METRICS = {  # of `evaluate`: the key of a row, and the sign with which lower is better
     "growth of the one-step error with shuffled actions": ("gap_of_actions.shuffled", -1),
@@ -22,6 +23,7 @@ METRICS = {  # of `evaluate`: the key of a row, and the sign with which lower is
     "spread of the energy over actions": ("ranking.spread", -1),
     "rollout error relative to persistence, 0.8 s ahead": ("rollout.l1.over_persistence.3", 1),
 }
+FIXED_ORDER = ("LoRA, rank 32", "full fine-tuning", "LoRA, rank 4", BASE)  # a choice without a measurement
 Results = dict[int, dict[str, Figures]]  # by lab and method
 Advice = Callable[[Figures], str]  # result of a trained method -> the checkpoint to use
 
@@ -35,19 +37,25 @@ def _adapt_never(result: Figures) -> str:  # noqa: ARG001 - the interface of an 
 
 
 def _use_selected(result: Figures) -> str:
-    return BASE if result["selected"] == checkpoint_name(0) else SELECTED
+    step = select_step(result["validations"])
+    if step is None or checkpoint_name(step) != result["selected"]:
+        raise ValueError(f"{result['cell']}: the rule selects step {step}, the measured one is {result['selected']}")
+    return SELECTED if step else BASE
 
 
-def _use_selected_if_better(result: Figures) -> str:
-    verdicts = result["evaluation"][SELECTED if SELECTED in result["evaluation"] else NEWEST]["verdicts"]
-    return _use_selected(result) if verdicts[RANKING]["conclusion"] == "yes" else BASE
+def _use_newest_if(name: str) -> Advice:
+    def advise(result: Figures) -> str:
+        return NEWEST if result["evaluation"][NEWEST]["verdicts"][name]["conclusion"] == "yes" else BASE
+
+    return advise
 
 
 ADVICE: dict[str, Advice] = {
-    "always adapt": _adapt_always,
-    "never adapt": _adapt_never,
-    "selected checkpoint (`keep_best`)": _use_selected,
-    "selected checkpoint if `evaluate` says better action ranking": _use_selected_if_better,
+    "always the newest checkpoint": _adapt_always,
+    "always the base model": _adapt_never,
+    "the selected checkpoint (`keep_best`)": _use_selected,
+    "the newest checkpoint, if `evaluate` reports better action ranking": _use_newest_if(RANKING),
+    "the newest checkpoint, if `evaluate` reports better prediction": _use_newest_if(PREDICTION),
 }
 
 
@@ -68,7 +76,19 @@ def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:
         f"**{title[0].upper()}{title[1:]}**\n\n{advice_table(group)}" for title, group in groups.items() if group
     )
     with_base, trained = metrics_table(complete, with_base=True), metrics_table(complete, with_base=False)
-    metrics = f"**With the base model**\n\n{with_base}\n\n**Fine-tuned models only**\n\n{trained}"
+    diverse = {number: methods for number, methods in complete.items() if get_lab(number).recipe == DIVERSE}
+    metrics = "\n\n".join(
+        f"**{title}**\n\n{table}"
+        for title, table in (
+            ("With the base model", with_base),
+            ("Fine-tuned models only", trained),
+            (
+                "With the base model, without labs with low-diversity demonstrations",
+                metrics_table(diverse, with_base=True),
+            ),
+            ("Fine-tuned models only, without these labs", metrics_table(diverse, with_base=False)),
+        )
+    )
     status = f"{len(complete)} of {LABS} labs are measured."
     path.write_text("\n\n".join((status, all_labs_table(complete), gains_table(complete), advice, metrics)) + "\n")
     if len(complete) == LABS:
@@ -105,20 +125,32 @@ def all_labs_table(labs: Results) -> str:
 
 
 def gains_table(labs: Results) -> str:
-    """Return for each method in how many labs it gains at least 10 points, with Wilson's interval, and its gains."""
-    heads = ("method", "labs with a gain of 10 points", "95 % interval over labs", "median gain", "worst loss")
+    """Return in how many of the drawn labs each method gains at least 10 points, and its gains in the chosen labs.
+
+    All gains are in percentage points of the success rate. The share has Wilson's interval.
+    """
+    drawn = [number for number in labs if get_lab(number).condition == DRAWN]
+    chosen = sorted(set(labs) - set(drawn), key=lambda number: (get_lab(number).recipe != DIVERSE, number))
+    titles = [
+        f"lab {number}, {'no shift' if get_lab(number).recipe == DIVERSE else 'low diversity'}" for number in chosen
+    ]
+    share_head = f"drawn labs with a gain of 10 points, of {len(drawn)}"
+    heads = ("method", share_head, "95 % interval of the share", "median gain", "smallest gain", *titles)
     rows = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for method in measured_methods(labs)[1:]:
-        gains = [success_rate(methods[method]) - success_rate(methods[BASE]) for methods in labs.values()]
-        share = estimate_share(sum(gain >= GAIN - 1e-9 for gain in gains), len(gains))
-        interval = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
-        median, worst = 100 * np.median(gains), 100 * min(min(gains), 0.0)
+        gains = {
+            number: 100 * (success_rate(methods[method]) - success_rate(methods[BASE]))
+            for number, methods in labs.items()
+        }
+        in_drawn = [gains[number] for number in drawn]
+        share = estimate_share(sum(gain >= GAIN - 1e-9 for gain in in_drawn), len(in_drawn))
         row = (
             method,
-            f"{100 * share.value:.0f} % of {len(gains)}",
-            interval,
-            f"{median:+.0f} points",
-            f"{worst:.0f} points",
+            f"{sum(gain >= GAIN - 1e-9 for gain in in_drawn)}",
+            f"{100 * share.low:.0f} to {100 * share.high:.0f} %",
+            f"{np.median(in_drawn):+.1f}",
+            f"{min(in_drawn):+.0f}",
+            *(f"{gains[number]:+.0f}" for number in chosen),
         )
         rows.append(f"| {' | '.join(row)} |")
     return "\n".join(rows)
@@ -134,7 +166,7 @@ def advice_table(labs: Results) -> str:
     runs = [(methods[BASE], methods[method]) for methods in labs.values() for method in TRAINED]
     heads = ("advice", "sensitivity", "specificity", "regret", "success rate")
     rows = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    gains = [success_rate(trained) - success_rate(base) >= GAIN - 1e-9 for base, trained in runs]
+    gains = [100 * (success_rate(trained) - success_rate(base)) >= GAIN - 1e-9 for base, trained in runs]
     for name, advise in ADVICE.items():
         advised = [advise(trained) for _, trained in runs]
         used = [
@@ -170,6 +202,9 @@ def metrics_table(labs: Results, *, with_base: bool) -> str:
         title: [[_metric(methods, method, key, sign) for method in candidates] for methods in labs.values()]
         for title, (key, sign) in METRICS.items()
     }
+    metrics[f"none: the order {'; '.join(FIXED_ORDER[: len(candidates)])}"] = [
+        [float(FIXED_ORDER.index(method)) for method in candidates] for _ in labs
+    ]
     return rate_choices(metrics, rates)
 
 

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from predecessor import ALL, BASE_VIEW, CONDITIONS, VIEWS, Condition
-from results import REACHED_CM, Figures
+from results import REACHED_CM, Figures, select_step
 from tables import insert_table
 
-from vjepa2_ac.evaluation.summary import is_better_than_chance
-from vjepa2_ac.intervals import Estimate
-from vjepa2_ac.runs.checkpoint import RunState
+from vjepa2_ac.intervals import estimate_share
 
 PUBLISHED = {  # base model and fine-tuned model; V-Jepa-2-Fine-Tuning @ 4d4050e, 30 pairs of frames of droid_100
     "offset": ("13.8 cm", "20.3 cm"),
@@ -65,7 +62,16 @@ def figures_table(results: Results) -> str:
             for each in (base, results["all mistakes"])
         )
         rows.append(_row((label, *PUBLISHED[name], *ours)))
+        if name == "offset":
+            rows.append(_row(("distance of a random point from the true action", *_random_offsets(results))))
     return "\n".join(rows)
+
+
+def _random_offsets(results: Results) -> Iterator[str]:
+    """Yield the mean distance of a random grid point from the true action; the published one is for a true action 0."""
+    yield from ("11.9 cm", "11.9 cm")
+    for each in (results["base model, wrist, stride 8"], results["all mistakes"]):
+        yield f"{mean_of(each, 'random_offset_cm'):.1f} cm" if each else NOT_MEASURED
 
 
 def mean_of(results: Sequence[Figures], key: str, view: str = "own") -> float:
@@ -77,7 +83,7 @@ def mean_of(results: Sequence[Figures], key: str, view: str = "own") -> float:
 def conditions_table(results: Results) -> str:
     """Return the mean metrics of each condition, after those of the base model in the same view."""
     heads = ("model", "measured on", "seeds", "offset", "rank", "relative energy", "sharpness", "action-ranking error",
-             "rollout error", "goals reached")  # fmt: skip
+             "rollout error", "goals reached (95 % interval)")  # fmt: skip
     rows = [_row(heads), _rule(len(heads))]
     for view in VIEWS:
         rows.append(_condition_row("base model", view, results[f"base model, {view}"], "own"))
@@ -98,8 +104,10 @@ def _condition_row(name: str, view: str, results: Sequence[Figures], measured: s
         for key in ("offset_cm", "rank", "relative_energy", "sharpness", "ranking", "rollout_error")
     }
     ends = [end for result in results for end in result.get("ends_cm", ())]
-    is_planned = view == Condition(stride=ALL[results[0]["cell"]["condition"]].planning_stride).view
-    success = f"{100 * np.mean([end < REACHED_CM for end in ends]):.0f} % of {len(ends)}" if ends and is_planned else ""
+    condition = ALL[results[0]["cell"]["condition"]]
+    is_planned = view == Condition(stride=condition.planning_stride).view or condition.is_validated
+    share = estimate_share(sum(end < REACHED_CM for end in ends), len(ends)) if ends and is_planned else None
+    success = "" if share is None else f"{100 * share.value:.0f} % ({100 * share.low:.0f} to {100 * share.high:.0f} %)"
     return _row(
         (
             name,
@@ -131,18 +139,6 @@ def selection_table(results: Results) -> str:
         counts = (f"{each.count(0)} of {len(runs)} runs" for each in steps)
         rows.append(_row((name, f"{100 * base:.0f} %", f"{100 * lowest:.0f} %", *counts)))
     return "\n".join(rows)
-
-
-def select_step(validations: Sequence[Figures], *, is_former_rule: bool = False) -> int | None:
-    """Return the step that `checkpoint.keep_best: ranking` selects, also for a run that did not use it.
-
-    The former rule did not require that a checkpoint is shown to rank actions better than chance.
-    """
-    state = RunState(step=0)
-    for each in validations:
-        if is_former_rule or each["step"] == 0 or is_better_than_chance(Estimate(*each["ranking"])):
-            state = replace(state, step=each["step"]).with_validation(each["rollout_error"], each["ranking"][0])
-    return state.best_step
 
 
 def measurements_table(results: Results) -> str:

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from environments import SAME
 from methods import METHODS
 
+from vjepa2_ac.evaluation.summary import is_better_than_chance
 from vjepa2_ac.intervals import Estimate, estimate_share
+from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.storage import write_atomically
 
 RESULTS = Path(__file__).with_name("results")
@@ -106,6 +109,22 @@ def _episodes(measured: Figures) -> Figures:
     if "hand_cm" in measured:
         stored["arrived"] = [int(distance < REACHED_CM) for distance in measured["hand_cm"]]
     return stored
+
+
+def select_step(validations: Sequence[Figures], *, is_former_rule: bool = False) -> int | None:
+    """Return the step that `checkpoint.keep_best: ranking` selects, also for a run that did not use it.
+
+    The former rule did not require that a checkpoint is shown to rank actions better than chance.
+
+    Args:
+        validations: The step, the rollout error and the action-ranking error with its interval (`ranking`).
+        is_former_rule: Whether to use the former rule.
+    """
+    state = RunState(step=0)
+    for each in validations:
+        if is_former_rule or each["step"] == 0 or is_better_than_chance(Estimate(*each["ranking"])):
+            state = replace(state, step=each["step"]).with_validation(each["rollout_error"], each["ranking"][0])
+    return state.best_step
 
 
 def select_results(results: Sequence[Figures], **values: Any) -> list[Figures]:

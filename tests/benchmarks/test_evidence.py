@@ -100,12 +100,12 @@ def test_tables_of_the_page_equal_the_stored_results(evidence: Any, stored: Any)
     assert evidence.tables.summary(stored) in page
     assert evidence.tables.summary_of_tasks(stored) in page
     assert evidence.tables.summary_of_correlations(evidence.tables.correlated_numbers(stored)) in page
-    assert evidence.tables.choice_table(stored) in page
-    assert evidence.tables.choice_table([result for result in stored if result["cell"]["episodes"]]) in page
     assert evidence.tables.difference_table(stored) in page
     text = (evidence.results.RESULTS / "methods.md").read_text()
     assert "\n\n".join(evidence.tables._rows(stored)) in text
     assert evidence.tables.goal_by_goal(stored) in text
+    assert evidence.tables.choice_table(stored) in text
+    assert evidence.tables.choice_table([result for result in stored if result["cell"]["episodes"]]) in text
     selection = json.loads((evidence.results.RESULTS / "selection.json").read_text())
     rules = "\n".join(evidence.selection_tables._rules(evidence.selection_tables.by_run(selection)))
     assert rules in (evidence.results.RESULTS / "selection.md").read_text()
@@ -326,23 +326,36 @@ def test_candidates_of_the_rates_study_differ_and_use_other_labs(evidence: Any) 
 def test_advice_table_counts_helpful_and_harmful_adaptation(evidence: Any) -> None:
     tables, methods = evidence.labs_tables, evidence.labs.METHODS
 
-    def trained(distances_cm: float, *, selected: int, conclusion: str) -> dict[str, Any]:
-        name = "newest" if selected == 400 else "selected"
-        verdicts = {"newest": {"verdicts": {"better action ranking": {"conclusion": conclusion}}}}
-        verdicts[name] = verdicts["newest"]
-        loops = {"newest": [distances_cm] * 20}
-        return {"selected": f"step-{selected:08d}", "evaluation": verdicts, "closed_loop": loops}
+    def trained(distances_cm: float, *, selected: int, ranking: float) -> dict[str, Any]:
+        conclusions = {"better action ranking": "yes" if selected else "no", "better prediction": "yes"}
+        verdicts = {name: {"conclusion": conclusion} for name, conclusion in conclusions.items()}
+        steps = {0: 0.2, 400: ranking}
+        validations = [
+            {"step": step, "rollout_error": 1.0, "ranking": [error, error - 0.1, error + 0.1]}
+            for step, error in steps.items()
+        ]
+        result = {"selected": f"step-{selected:08d}", "validations": validations, "cell": {}}
+        return result | {
+            "evaluation": {"newest": {"verdicts": verdicts}},
+            "closed_loop": {"newest": [distances_cm] * 20},
+        }
 
     base = {"closed_loop": {"newest": [1.0] * 10 + [9.0] * 10}}  # 50 %
-    helpful, harmful = trained(1.0, selected=400, conclusion="yes"), trained(9.0, selected=0, conclusion="no")
+    helpful, harmful = trained(1.0, selected=400, ranking=0.1), trained(9.0, selected=0, ranking=0.3)
     lab = dict.fromkeys(methods, helpful) | {methods[0]: base, "full fine-tuning": harmful}
     rows = {line.split("|")[1].strip(): line for line in tables.advice_table({7: lab}).splitlines()}
-    assert "| 2 of 2 | 0 of 1 | 16.7 points | 67 % |" in rows["always adapt"]
-    assert "| 0 of 2 | 1 of 1 | 33.3 points | 50 % |" in rows["never adapt"]
-    assert "| 2 of 2 | 1 of 1 | 0.0 points | 83 % |" in rows["selected checkpoint (`keep_best`)"]
-    gains = {line.split("|")[1].strip(): line for line in tables.gains_table({7: lab}).splitlines()}
-    assert "| 0 % of 1 |" in gains["full fine-tuning"]
-    assert "| -50 points | -50 points |" in gains["full fine-tuning"]
+    newest = "the newest checkpoint, if `evaluate` reports"
+    assert "| 2 of 2 | 0 of 1 | 16.7 points | 67 % |" in rows["always the newest checkpoint"]
+    assert "| 0 of 2 | 1 of 1 | 33.3 points | 50 % |" in rows["always the base model"]
+    assert "| 2 of 2 | 1 of 1 | 0.0 points | 83 % |" in rows["the selected checkpoint (`keep_best`)"]
+    assert "| 2 of 2 | 1 of 1 | 0.0 points | 83 % |" in rows[f"{newest} better action ranking"]
+    assert "| 2 of 2 | 0 of 1 | 16.7 points | 67 % |" in rows[f"{newest} better prediction"]
+    gains = {line.split("|")[1].strip(): line for line in tables.gains_table({7: lab, 3: lab}).splitlines()}
+    assert gains["full fine-tuning"] == "| full fine-tuning | 0 | 0 to 79 % | -50.0 | -50 | -50 |"
+    assert gains["LoRA, rank 4"] == "| LoRA, rank 4 | 1 | 21 to 100 % | +50.0 | +50 | +50 |"
+    wrong = lab | {"LoRA, rank 4": helpful | {"selected": "step-00000000"}}
+    with pytest.raises(ValueError, match="the rule selects step 400"):
+        tables.advice_table({7: wrong})
 
 
 def test_adapting_planner_trains_on_its_transitions_only_from_the_second_decision(evidence: Any) -> None:
@@ -470,11 +483,12 @@ def test_choice_table_has_no_regret_for_a_metric_that_orders_the_models(evidence
 
     results = [result(seed, 0.1 * index, 9 - 3 * index) for seed in range(5) for index in range(3)]
     rows = {line.split("|")[1].strip(): line for line in evidence.tables.choice_table(results).splitlines()}
-    assert "| 1.00 | 1.00 to 1.00 | 0.0 | 0.0 to 0.0 |" in rows["**action-ranking error**"]
+    assert "| 1.00 | 1.00 to 1.00 | 0.0 | +30.0 | +30.0 to +30.0 |" in rows["**action-ranking error**"]
     assert (
-        "| -1.00 | -1.00 to -1.00 | 60.0 | 60.0 to 60.0 |" in rows["rollout error relative to persistence, 0.8 s ahead"]
+        "| -1.00 | -1.00 to -1.00 | 60.0 | -30.0 | -30.0 to -30.0 |"
+        in rows["rollout error relative to persistence, 0.8 s ahead"]
     )
-    assert "| 30.0 | 30.0 to 30.0 |" in rows["none: average of all models"]
+    assert "| 30.0 |  |  |" in rows["none: average of all models"]
     assert evidence.tables.choice_table(results[:6]) == ""
 
 

@@ -39,12 +39,13 @@ _wrap = partial(wrap, break_on_hyphens=False)  # commands and paths contain hyph
 
 
 PREDICTION, SENSITIVITY, RANKING = "better prediction", "sensitive to actions", "better action ranking"
-PLANNING, LANDSCAPE = "plans better", "better landscape"
+PLANNING, LANDSCAPE = "better than random", "better landscape"
 _FORMER_NAMES = {  # in files of earlier versions
     "predicts": PREDICTION,
     "uses actions": SENSITIVITY,
     "ranks actions": RANKING,
     "plans": PLANNING,
+    "plans better": PLANNING,
     "landscape": LANDSCAPE,
 }
 
