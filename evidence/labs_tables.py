@@ -20,7 +20,7 @@ BASE, TRAINED = METHODS[0], ("LoRA, rank 4", "LoRA, rank 32", "full fine-tuning"
 METRICS = {  # of `evaluate`: the key of a row, and the sign with which lower is better
     "growth of the one-step error with shuffled actions": ("gap_of_actions.shuffled", -1),
     "**action-ranking error**": ("ranking.rank", 1),
-    "spread of the energy over actions": ("ranking.spread", -1),
+    "standard deviation of the energy over alternative actions": ("ranking.spread", -1),
     "rollout error relative to persistence, 0.8 s ahead": ("rollout.l1.over_persistence.3", 1),
 }
 FIXED_ORDER = ("LoRA, rank 32", "full fine-tuning", "LoRA, rank 4", BASE)  # a choice without a measurement

@@ -25,7 +25,7 @@ KINDS = {"narrow": "low-diversity data", "varied": "diverse data"}
 TITLES = {
     "one_step": "one-step error relative to persistence",
     "error": "rollout error relative to persistence, last horizon",
-    "shuffled": "growth of the error with shuffled actions",
+    "shuffled": "growth of the one-step error with shuffled actions",
     "ranking": "**action-ranking error**",
     "spread": "standard deviation of the energy over alternative actions",
 }

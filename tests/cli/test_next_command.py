@@ -11,10 +11,9 @@ import pytest
 import vjepa2_ac
 from vjepa2_ac.cli.closed_loop import _make_summary
 from vjepa2_ac.cli.evaluate import _recommend_next
-from vjepa2_ac.cli.options import FAST, make_option_words, parse_arguments, propose_fast_search
+from vjepa2_ac.cli.options import make_option_words, parse_arguments
 from vjepa2_ac.cli.program import _make_parser
 from vjepa2_ac.config.loading import config_as_yaml, load_config
-from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.errors import shell_command
 from vjepa2_ac.evaluation.summary import Summary, not_measured_verdict
 from vjepa2_ac.reports.metrics_json import METRICS_FILE
@@ -37,24 +36,6 @@ def test_option_words_parse_to_the_same_options() -> None:
     line = shlex.split(shell_command("serve", "my run", *make_option_words(options, *names)))
     assert without_parser(parse(line[1:])) == without_parser(options)
     assert make_option_words(options, "checkpoint") == ["--checkpoint", "3"]
-
-
-@pytest.mark.parametrize(
-    ("words", "settings", "on_cpu", "is_quick"),
-    [
-        ([], {}, True, True),
-        ([], {}, False, False),
-        ([], {"samples": 64, "iterations": 4}, True, False),
-        (["planning.samples=800"], {}, True, False),
-        (["planning.horizon=2"], {"horizon": 2}, True, True),
-        ([], {"budget_s": 1.0}, True, False),
-        ([], {"planner": {"name": "cem", "options": {"elites": 100}}}, True, False),
-    ],
-)
-def test_quick_search_is_proposed_on_a_cpu_unless_the_config_sets_the_search(
-    words, settings, *, on_cpu: bool, is_quick: bool
-) -> None:
-    assert propose_fast_search(words, PlanningConfig(**settings), on_cpu=on_cpu) == [FAST] * is_quick
 
 
 def get_next_command(
@@ -102,7 +83,7 @@ def test_simulate_is_recommended_only_for_simulated_data(monkeypatch: pytest.Mon
     recorded = RecordedSimulation.of(RecordingSpec("B", task="pick"), 3)
     monkeypatch.setattr(record, "read_simulation", lambda _: recorded)
     (command,) = get_next_command(arguments)
-    expected = f"simulate builtin:sim-tiny --task pick --domain B --checkpoint 8 {FAST}"
+    expected = "simulate builtin:sim-tiny --task pick --domain B --checkpoint 8"
     assert command == f"Next: vjepa2-ac {expected}"
     parse(shlex.split(expected))
 

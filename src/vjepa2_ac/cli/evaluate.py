@@ -150,8 +150,6 @@ def _recommend_next(measured: WrittenEvaluation, options: argparse.Namespace) ->
 
 def _make_simulate_words(about: About, options: argparse.Namespace) -> list[str]:
     """Return the arguments of the command that tests a run in closed loop; empty unless its data were simulated."""
-    from vjepa2_ac.distributed import is_on_cpu
-    from vjepa2_ac.planning.settings import load_planning_config
     from vjepa2_ac.simulation.domains import Domain
     from vjepa2_ac.simulation.record import read_simulation
 
@@ -160,8 +158,6 @@ def _make_simulate_words(about: About, options: argparse.Namespace) -> list[str]
     except (OSError, UserError):
         return []
     task, domain = recorded.task or "reach", recorded.worlds.name if isinstance(recorded.worlds, Domain) else "A"
-    config = load_planning_config(about.subject, overrides=options.overrides)
-    fast = cli.propose_fast_search(options.overrides, config.planning, on_cpu=is_on_cpu(config.training))
     words = [
         "simulate",
         about.subject,
@@ -171,7 +167,7 @@ def _make_simulate_words(about: About, options: argparse.Namespace) -> list[str]
         domain,
         *cli.make_option_words(options, "checkpoint"),
     ]
-    return [*words, *options.overrides, *fast]
+    return [*words, *options.overrides]
 
 
 def _compare(options: argparse.Namespace) -> None:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import expand_presets, load_config, load_config_of_run
-from vjepa2_ac.config.planning import ELITES, PRESETS, PlanningConfig
 from vjepa2_ac.errors import InputError, did_you_mean, printable, shell_command
 from vjepa2_ac.process import is_first_process
 from vjepa2_ac.reporter import INDEXING
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 Handler = Callable[[argparse.Namespace], int | None]
 
-FAST = "planning.preset=fast"
 _MAX_COUNT = 10**9
 _OPTION = re.compile(r"-(?![\d.])")  # a word such as -0.3 is a value, not an option
 _Record = TypeVar("_Record")
@@ -466,20 +464,3 @@ def make_option_words(options: argparse.Namespace, *names: str) -> list[str]:
             for item in value if isinstance(value, list) else [value]:
                 words += [action.option_strings[-1], str(item)]
     return words
-
-
-def propose_fast_search(words: Sequence[str], planning: PlanningConfig, *, on_cpu: bool) -> list[str]:
-    """Return the override for the fast preset if a search on a CPU would take long.
-
-    Args:
-        words: The user's overrides. If they set the size of the search, the result is empty.
-        planning: The planning config.
-        on_cpu: Whether the model runs on a CPU; otherwise the result is empty.
-    """
-    from vjepa2_ac.planning.planner import count_samples_per_iteration
-
-    is_chosen = any(word.startswith(("planning.samples=", "planning.iterations=")) for word in words)
-    is_sampled, elites = planning.planner.name != "gradient", planning.planner.options.get("elites", ELITES)
-    samples, iterations = PRESETS["fast"].values()
-    is_long = planning.budget_s is None and sum(count_samples_per_iteration(planning)) > samples * iterations
-    return [FAST] if on_cpu and is_sampled and is_long and not is_chosen and elites <= samples else []

@@ -25,7 +25,7 @@ _COLUMNS = 100
 def add_plan(commands: cli.Commands) -> None:
     """Add `plan` to a parser."""
     parser = cli.add_command(commands, "plan", _plan, "demo/run --start a.png --goal b.png --state 0.4,0,0.3,3,0,0,0")
-    cli.add_planner(parser, f"such as planning.horizon=2; for a CPU: {cli.FAST}")
+    cli.add_planner(parser, "such as planning.horizon=2 or planning.preset=paper (fast)")
     cli.add(parser, "--start IMAGE", "the current camera image: PNG or JPEG", cli.as_local, required=True)
     text = "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or a vector"
     cli.add(parser, "--state NUMBERS", text, cli.as_numbers, required=True)
@@ -109,7 +109,7 @@ def _plan(options: argparse.Namespace) -> int:
         decoder.require_compatible(session.world_model, session.config.data, subject=options.subject)
     request = PlanRequest(start, state, goals, mask)
     with cli.make_reporter() as reporter:
-        reporter.note(_describe_search(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
+        reporter.note(_describe_search(session.config.planning))
         controller = Controller.of_subject(session, seed=options.seed, extrinsics=options.extrinsics)
         controller.planner.progress = reporter.task("planning", "action sequences")
         result = decide(controller, request, nodes=options.nodes, reporter=reporter)
@@ -125,8 +125,8 @@ def _plan(options: argparse.Namespace) -> int:
     return int(result.decision.why == "no finite energy" or bool(result.worse_than))
 
 
-def _describe_search(config: PlanningConfig, *, on_cpu: bool) -> str:
-    """Return a line with the size of the search, and on a CPU a line with the overrides for a faster search."""
+def _describe_search(config: PlanningConfig) -> str:
+    """Return a line with the size of the search."""
     from vjepa2_ac.planning.planner import count_samples_per_iteration
 
     sequences, steps = (
@@ -135,8 +135,7 @@ def _describe_search(config: PlanningConfig, *, on_cpu: bool) -> str:
     )
     text = f"Planning: {sequences} of {steps} in {counted(config.iterations, 'iteration')}"
     text += "" if config.budget_s is None else f", for {config.budget_s:g} s at most"
-    proposed = cli.propose_fast_search([], config, on_cpu=on_cpu)
-    return f"{text}." + f"\nFaster, for a CPU: {cli.FAST}" * bool(proposed)
+    return f"{text}."
 
 
 def _read_images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

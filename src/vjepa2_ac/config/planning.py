@@ -103,10 +103,11 @@ class PlanningConfig(Section):
     action_repeat: PositiveInt = 1
     """Number of model steps for which a plan repeats each action; the horizon must be a multiple of it. A new plan is
     made at every model step."""
-    samples: Annotated[int, Field(ge=2)] = 800
-    """Number of action sequences per iteration; the planner gradient has the option `starts` instead."""
-    iterations: PositiveInt = 10
-    """Number of iterations of sampling and fitting."""
+    samples: Annotated[int, Field(ge=2)] = PRESETS["fast"]["samples"]
+    """Number of action sequences per iteration; the planner gradient has the option `starts` instead. The paper uses
+    800; the override planning.preset=paper sets samples and iterations."""
+    iterations: PositiveInt = PRESETS["fast"]["iterations"]
+    """Number of iterations of sampling and fitting. The paper uses 10."""
     budget_s: Positive | None = None
     """Time limit of a search in seconds: an iteration that would end later is not started, and the best plan so far is
     used. The first iteration always runs. Encoding the frame does not count. null: all iterations run."""
