@@ -444,7 +444,7 @@ def test_closed_loop_table_compares_the_same_problems_of_all_tasks(evidence: Any
     assert evidence.iterations_tables.closed_loop_table(incomplete) == ""
 
 
-def test_tables_enter_the_page_when_every_search_but_the_largest_is_measured(evidence: Any, tmp_path: Path) -> None:
+def test_tables_enter_the_page_when_decisions_and_first_searches_are_measured(evidence: Any, tmp_path: Path) -> None:
     study, tables = evidence.iterations, evidence.iterations_tables
     marks = [f"<!-- {mark}: begin -->\n<!-- {mark}: end -->" for mark in tables.MARKS]
     page = tmp_path / "planning.md"
@@ -456,12 +456,12 @@ def test_tables_enter_the_page_when_every_search_but_the_largest_is_measured(evi
             rows = {str(count): [[1.0, 0.0, 0.0, 0.4, 0.5]] * 2 for count in study.ITERATIONS}
             result |= {"oracle": [[5.0, 0.0, 3.0]] * 2, "zero_action_energy": [0.6] * 2, "searches": rows}
         results.append(result if cell.kind == "decisions" else result | {"solved": [1, 0]})
-    largest = len(study.TASKS)
-    tables.write_tables(results[: -largest - 1], tmp_path / "iterations.md", tmp_path)
+    needed = len(study.TASKS) * (len(study.SAMPLES) + tables.NEEDED)
+    tables.write_tables(results[: needed - 1], tmp_path / "iterations.md", tmp_path)
     assert page.read_text() == "\n".join(marks)
-    tables.write_tables(results[:-largest], tmp_path / "iterations.md", tmp_path)
-    assert page.read_text().count("| 64 | 10 | 640 |") == 2
-    assert (tmp_path / "iterations.md").read_text().count("| 64 | 10 | 640 |") == 2 + len(study.TASKS)
+    tables.write_tables(results[:needed], tmp_path / "iterations.md", tmp_path)
+    assert page.read_text().count("| 64 | 3 | 192 |") == 2
+    assert (tmp_path / "iterations.md").read_text().count("| 64 | 3 | 192 |") == 2 + len(study.TASKS)
 
 
 def test_holm_correction_equals_the_worked_example(evidence: Any) -> None:

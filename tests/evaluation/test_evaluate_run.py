@@ -41,7 +41,7 @@ def config(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, base_fol
         folder / "run", data_folder, base_folder,
         data__test_share=0.4, data__cache_dir=str(folder / "caches"), data__cache_dtype="fp32",
         training__steps=2, training__accumulation=1, training__learning_rate=1e-2, training__warmup_steps=0,
-        validation__every=2, validation__batch_size=3,
+        validation__every=2, validation__batch_size=3, checkpoint__keep_best="off",
     )  # fmt: skip
     train(config, SILENT)
     return config

@@ -22,13 +22,14 @@ from vjepa2_ac.simulation.counterfactual import simulated_outcome
 from vjepa2_ac.spaces import actions_from_states
 
 STEPS = 3
+NEWEST = EvaluationOptions(checkpoint="newest")  # the selected checkpoint is the base model
 Imagine = Callable[..., RolloutComparison]
 
 
 @pytest.fixture
 def imagine(whole_run: Path, whole_decoder: Path) -> Imagine:  # noqa: F811 - the fixture
     def compare_rollouts(subject: Path = whole_run, **requested: object) -> RolloutComparison:
-        options = {"decoder": str(whole_decoder), "steps": STEPS, **requested}
+        options = {"decoder": str(whole_decoder), "steps": STEPS, "evaluation": NEWEST, **requested}
         return imagine_clip(str(subject), ImagineOptions(**options))  # type: ignore[arg-type]
 
     return compare_rollouts
@@ -168,7 +169,7 @@ def test_model_is_rolled_out_on_the_given_data(
 
 
 def test_real_data_have_no_simulated_outcome(whole_run: Path, whole_decoder: Path) -> None:  # noqa: F811
-    requested = ImagineOptions(decoder=str(whole_decoder), actions=("up",), steps=2)
+    requested = ImagineOptions(decoder=str(whole_decoder), actions=("up",), steps=2, evaluation=NEWEST)
     comparison = imagine_clip(str(whole_run), requested, simulate=simulated_outcome)
     assert (comparison.notes, [rollout.truth for rollout in comparison.rollouts]) == ((), [None, None])
 

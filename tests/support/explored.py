@@ -31,7 +31,7 @@ def explorer_of(subject: Path, decoder: Path, options: EvaluationOptions) -> tup
 def views_of(subject: Path, decoder: Path, data: Path, folder: Path, base: Path) -> Views:
     """Return the views of a run on data, with a small search."""
     config = tiny_config(folder / "none", data, base, data__test_share=0.5, data__stride=2)
-    explorer, config = explorer_of(subject, decoder, EvaluationOptions(data=config, out=folder))
+    explorer, config = explorer_of(subject, decoder, EvaluationOptions(data=config, out=folder, checkpoint="newest"))
     return Views.create("the run", explorer, config.model_copy(update={"planning": QUICK}))
 
 
