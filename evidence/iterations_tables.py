@@ -32,7 +32,7 @@ MARKS = tuple(f"{name}, made by `make evidence`" for name in ("decisions", "sear
 
 
 def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:
-    """Write all tables to a file, and two into docs/planning.md if decisions and the first searches are measured."""
+    """Write all tables to a file, and into docs/planning.md those whose needed cells are all measured."""
     if not results:
         return
     measured = {tuple(result["cell"].values()) for result in results}  # kind, task, samples, iterations
@@ -44,10 +44,11 @@ def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:
     if closed_loop := closed_loop_table(results):
         parts.append(f"**Closed loop**\n\n{closed_loop}")
     path.write_text("\n\n".join(parts) + "\n")
-    needed = {("closed loop", task, *search) for task in TASKS for search in SETTINGS[:NEEDED]}
-    if len(tasks) == len(TASKS) and needed <= measured:
-        for mark, table in zip(MARKS, (decisions_table(results, tasks), closed_loop), strict=True):
-            insert_table(docs / "planning.md", mark, table)
+    decisions_mark, searches_mark = MARKS
+    if len(tasks) == len(TASKS):
+        insert_table(docs / "planning.md", decisions_mark, decisions_table(results, tasks))
+    if {("closed loop", task, *search) for task in TASKS for search in SETTINGS[:NEEDED]} <= measured:
+        insert_table(docs / "planning.md", searches_mark, closed_loop)
 
 
 def count_sequences(search: Search) -> int:

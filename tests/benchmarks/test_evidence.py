@@ -458,7 +458,7 @@ def test_tables_enter_the_page_when_decisions_and_first_searches_are_measured(ev
         results.append(result if cell.kind == "decisions" else result | {"solved": [1, 0]})
     needed = len(study.TASKS) * (len(study.SAMPLES) + tables.NEEDED)
     tables.write_tables(results[: needed - 1], tmp_path / "iterations.md", tmp_path)
-    assert page.read_text() == "\n".join(marks)
+    assert page.read_text().count("| 64 | 3 | 192 |") == 1, "decisions only"
     tables.write_tables(results[:needed], tmp_path / "iterations.md", tmp_path)
     assert page.read_text().count("| 64 | 3 | 192 |") == 2
     assert (tmp_path / "iterations.md").read_text().count("| 64 | 3 | 192 |") == 2 + len(study.TASKS)
