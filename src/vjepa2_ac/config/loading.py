@@ -148,7 +148,7 @@ def expand_presets(overrides: Iterable[str]) -> list[str]:
     expanded = list[str]()
     for override in overrides:
         key, _, name = override.partition("=")
-        if key != _PRESET:
+        if key != PRESET:
             expanded.append(override)
         elif name in PRESETS:
             expanded += [f"planning.{size}={value}" for size, value in PRESETS[name].items()]
@@ -198,7 +198,7 @@ def changed_keys(old: Config, new: Config) -> list[str]:
     return sorted(key for key in flat_old.keys() | flat_new.keys() if flat_old.get(key) != flat_new.get(key))
 
 
-_PRESET = "planning.preset"
+PRESET = "planning.preset"  # an override that stands for several keys
 _NO_BREAKS = 10**6  # characters per line, so that YAML breaks no line
 
 
