@@ -124,7 +124,8 @@ def test_variant_losses_of_a_perfect_and_of_an_action_blind_predictor(
     assert losses("contrast", true_latents) == {"variants": 0.0, "contrast": 0.0}
     blind = true_latents[:, :1].expand_as(true_latents)  # predicts the demonstration for all actions
     executed = (true_latents[:, 1:, -1] - true_latents[:, :1, -1]).abs().mean(dim=(2, 3))
-    assert losses("contrast", blind)["contrast"] == pytest.approx(variants.MARGIN * float(executed.mean()), rel=1e-5)
+    expected = variants.CONTRAST_WEIGHT * variants.MARGIN * float(executed.mean())
+    assert losses("contrast", blind)["contrast"] == pytest.approx(expected, rel=1e-5)
     shift = true_latents + 0.5  # only a common error
     assert losses("action-relative error", shift)["variants"] == pytest.approx(0.5, rel=1e-4)
     common, relative = variants.split_error(blind - true_latents)
