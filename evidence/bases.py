@@ -150,9 +150,9 @@ def make_cell_config(cell: Cell, folder: Path) -> Config:
 
 def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     """Train and measure a cell on one thread."""
-    result: dict[str, Any] = {}
     if cell.method == HELD_OUT:
-        return result | {"rows": _measure_held_out(cell.base, folder)}
+        return {"rows": _measure_held_out(cell.base, folder)}
+    result: dict[str, Any] = {}
     config = make_cell_config(cell, folder)
     if cell.method == ZERO_SHOT:
         model = load_base(config.model, seed=0).eval()

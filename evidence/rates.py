@@ -80,20 +80,19 @@ def prepare(cells: Sequence[Cell], work: Work) -> int:
 
 def measure(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:  # noqa: ARG001 - as of the other studies
     """Train, and return the error on held-out episodes; there are no goals."""
-    result: dict[str, Any] = {}
     run = folder / "rate-runs" / cell.name
     if cell.method in {PRIOR, PRETRAINED_PRIOR, ON_BASE_DATA}:
         on_base = cell.method == ON_BASE_DATA
         config = make_base_config(folder) if on_base else labs.make_config(labs.Cell(cell.lab, cell.method), folder)
         options = BASE_PRIOR if on_base else make_prior_options(cell.method, folder)
         held_out = train_prior(config, run, replace(options, learning_rate=cell.rate, steps=cell.steps)).held_out
-        return result | {"error": held_out["true_goals"]["value"]}
+        return {"error": held_out["true_goals"]["value"]}
     config = labs.make_config(labs.Cell(cell.lab, cell.method), folder)
     training = config.training.model_copy(update={"learning_rate": cell.rate, "steps": cell.steps})
     validation = ValidationConfig(every=cell.steps, clips=120, batch_size=20, ranking_clips=20, ranking_samples=16)
     train(config.model_copy(update={"run_dir": str(run), "training": training, "validation": validation}), SILENT)
     *_, last = (row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] == "validation")
-    return result | {"error": last["rollout_over_persistence_last"], "ranking_error": last["action_ranking_error"]}
+    return {"error": last["rollout_over_persistence_last"], "ranking_error": last["action_ranking_error"]}
 
 
 def write_tables(results: Sequence[Figures], path: Path, docs: Path) -> None:  # noqa: ARG001 - as of the other studies

@@ -15,7 +15,7 @@ from typing import Any
 from environments import SAME
 from methods import METHODS
 
-from vjepa2_ac.evaluation.summary import is_better_than_chance
+from vjepa2_ac.evaluation.summary import CHANCE
 from vjepa2_ac.intervals import Estimate, estimate_share
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.storage import write_atomically
@@ -122,7 +122,7 @@ def select_step(validations: Sequence[Figures], *, is_former_rule: bool = False)
     """
     state = RunState(step=0)
     for each in validations:
-        if is_former_rule or each["step"] == 0 or is_better_than_chance(Estimate(*each["ranking"])):
+        if is_former_rule or each["step"] == 0 or Estimate(*each["ranking"]).is_below(CHANCE):
             state = replace(state, step=each["step"]).with_validation(each["rollout_error"], each["ranking"][0])
     return state.best_step
 

@@ -42,6 +42,10 @@ class Estimate:
         """Return -1 or 1 if the whole interval is below or above a number, else 0: uncertain."""
         return -1 if self.high < value else 1 if self.low > value else 0
 
+    def is_below(self, value: float) -> bool:
+        """Return whether the whole interval is below a number; without an interval, whether the estimate is below."""
+        return (self.high if self.has_interval else self.value) < value
+
     def subtract_from(self, level: float) -> Estimate:
         """Return `level` minus the estimate, with its interval."""
         return Estimate(level - self.value, level - self.high, level - self.low)

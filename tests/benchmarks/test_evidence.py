@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.stats import binomtest
 
 import fake_world
 from paths import ROOT
@@ -126,6 +127,19 @@ def test_tables_of_the_labs_equal_the_stored_results(evidence: Any) -> None:
     assert tables.advice_table({number: methods for number, methods in labs.items() if number > 6}) in page
     for with_base in (True, False):
         assert tables.metrics_table(labs, with_base=with_base) in page
+    reached = {
+        (number, method): np.array(result["closed_loop"]["newest"]) < evidence.results.REACHED_CM
+        for number, methods in labs.items()
+        for method, result in methods.items()
+    }
+    changes = [100 * (reached[lab, "LoRA, rank 4"].mean() - reached[lab, "full fine-tuning"].mean()) for lab in labs]
+    lower, mean, p_value = sum(change < 0 for change in changes), -np.mean(changes), binomtest(11, 12).pvalue
+    assert (lower, sum(change > 0 for change in changes)) == (11, 1)
+    assert f"in {lower} of 12 labs, on average {mean:.0f} points less (sign test p = {p_value:.3f})" in page
+    pairs = [(reached[lab, "test-time adaptation"], reached[lab, "base model"]) for lab in labs]
+    won_lost = [(int((ours & ~base).sum()), int((base & ~ours).sum())) for ours, base in pairs]
+    smallest = min(binomtest(won, won + lost).pvalue for won, lost in won_lost if won + lost)
+    assert f"McNemar test, smallest p = {smallest:.2f}" in page
     verdicts = {
         (number in {3, 9}, name, verdict["conclusion"])
         for number, methods in labs.items()

@@ -365,7 +365,7 @@ def parse_arguments(parser: argparse.ArgumentParser, arguments: Sequence[str] | 
         words = " ".join(non_overrides)
         parser.error(f"{words!r} is not key=value (write numbers in one word, such as 0.4,0,0.3)")
     if takes_overrides:
-        options.overrides = expand_presets([*options.overrides, *rest])
+        options.overrides = expand_presets([*options.overrides, *rest])  # a manifest refuses the keys of a preset, too
     return options
 
 

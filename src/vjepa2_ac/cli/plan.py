@@ -25,7 +25,7 @@ _COLUMNS = 100
 def add_plan(commands: cli.Commands) -> None:
     """Add `plan` to a parser."""
     parser = cli.add_command(commands, "plan", _plan, "demo/run --start a.png --goal b.png --state 0.4,0,0.3,3,0,0,0")
-    cli.add_planner(parser, "such as planning.horizon=2 or planning.preset=paper (fast)")
+    cli.add_planner(parser, "such as planning.horizon=2, or planning.preset=paper for the search of the paper")
     cli.add(parser, "--start IMAGE", "the current camera image: PNG or JPEG", cli.as_local, required=True)
     text = "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or a vector"
     cli.add(parser, "--state NUMBERS", text, cli.as_numbers, required=True)

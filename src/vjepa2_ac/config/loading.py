@@ -198,7 +198,7 @@ def changed_keys(old: Config, new: Config) -> list[str]:
     return sorted(key for key in flat_old.keys() | flat_new.keys() if flat_old.get(key) != flat_new.get(key))
 
 
-PRESET = "planning.preset"  # an override that stands for several keys
+PRESET = "planning.preset"  # an override that sets several keys
 _NO_BREAKS = 10**6  # characters per line, so that YAML breaks no line
 
 

@@ -317,11 +317,6 @@ def _describe_blur(rows: Mapping[str, Row], base_rows: Mapping[str, Row], horizo
     return f"part of the gain may be blur: spread {spread:.2f}, {reference} {reference_spread:.2f}"
 
 
-def is_better_than_chance(ranking_error: Estimate) -> bool:
-    """Return whether the whole interval of an action-ranking error is below chance; without an interval, its value."""
-    return (ranking_error.high if ranking_error.has_interval else ranking_error.value) < CHANCE
-
-
 def _judge_gain(gain: Estimate, compared_with: str, ahead: str) -> Verdict:
     reference = "the base model's" if compared_with == _BASE else f"that of {compared_with}"
     statement = f"{ahead}, error {_format_change(gain, 'lower', 'higher')} than {reference}"

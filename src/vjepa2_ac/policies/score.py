@@ -150,7 +150,7 @@ def is_blind(error: Estimate | None) -> bool:
     Args:
         error: Share of other actions with a lower energy than the true ones. None (not measured) returns False.
     """
-    return error is not None and not (error.high if error.has_interval else error.value) < CHANCE
+    return error is not None and not error.is_below(CHANCE)
 
 
 def read_run_ranking_error(subject: str, checkpoint: str) -> Estimate | None:

@@ -17,7 +17,7 @@ from vjepa2_ac.evaluation.action_use import Transition, gather_transitions, rank
 from vjepa2_ac.evaluation.measure import prediction_errors, previous_clip_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Validation, cost_of_actions, one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.summary import CHANCE, format_interval, format_percent, is_better_than_chance
+from vjepa2_ac.evaluation.summary import CHANCE, format_interval, format_percent
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState
@@ -69,7 +69,7 @@ def action_warning(validation: Validation) -> str:
 def base_warning(validation: Validation) -> str:
     """Return a warning if a base model is not shown to rank actions better than chance, otherwise an empty string."""
     ranking = validation.ranking
-    if ranking is None or not ranking.rank.has_interval or is_better_than_chance(ranking.rank):
+    if ranking is None or not ranking.rank.has_interval or ranking.rank.is_below(CHANCE):
         return ""
     return (
         "Warning: the base model is not shown to rank actions better than chance (action-ranking error"
@@ -108,7 +108,7 @@ def _is_candidate(run: Run, metrics: Mapping[str, float]) -> bool:
     """
     if run.state.step == 0 or not _has_base(run):
         return True
-    return is_better_than_chance(Estimate(*(metrics[f"{RANKING_ERROR}{end}"] for end in ("", "_low", "_high"))))
+    return Estimate(*(metrics[f"{RANKING_ERROR}{end}"] for end in ("", "_low", "_high"))).is_below(CHANCE)
 
 
 def _has_base(run: Run) -> bool:
